@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 from chronoscene.figures import canvas
-from chronoscene.io.wording import printable
 from chronoscene.stats.counts import PeriodCount, SceneCount, period_title
 
 BAR = 0.3  # Inches per scene
@@ -27,7 +25,8 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
 
     periods = max(len(c.periods) for c in counts)
     colors = canvas.period_colors(periods)
-    longest = max(cell_len(_name(c)) for c in counts)
+    names = [canvas.short_name(c.name) for c in counts]
+    longest = max(map(cell_len, names))
     left, top, bottom = 0.25 + 0.075 * longest, 0.42, 0.5
     height = top + bottom + BAR * (len(counts) + 0.4)
     figure = canvas.new_figure(WIDTH, height)
@@ -43,16 +42,10 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
         axes = figure.add_axes((box[0] / WIDTH, box[1] / height, box[2] / WIDTH, box[3] / height))
         values = [[of(p) for p in c.periods] for c in counts]
         _draw_panel(axes, what, values, colors)
-        names = [canvas.plain(_name(c)) for c in counts] if i == 0 else []
-        axes.set_yticks(range(len(counts)), names)
+        axes.set_yticks(range(len(counts)), [] if i else map(canvas.plain, names))
         axes.tick_params(axis="y", length=0, labelsize=9)
     _legend(figure, _period_names(counts, periods), colors, 1 - 0.1 / height)
     canvas.save(figure, path)
-
-
-def _name(count: SceneCount) -> str:
-    name = printable(count.name)
-    return shorten(name, 28, placeholder="...") or name[:28]
 
 
 def _draw_panel(
@@ -103,7 +96,7 @@ def _period_names(counts: Sequence[SceneCount], periods: int) -> list[str]:
         names.append(titles.pop() if len(titles) == 1 else str(i))
     if all(name == str(i) for i, name in enumerate(names)):
         return [f"Period {i}" if i == 0 or periods < 7 else str(i) for i in range(periods)]
-    return [shorten(printable(name), 28, placeholder="...") or name[:28] for name in names]
+    return [canvas.short_name(name) for name in names]
 
 
 def _legend(figure: Any, names: Sequence[str], colors: Sequence[str], top: float) -> None:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 from warnings import catch_warnings, filterwarnings
 
@@ -27,12 +28,12 @@ GREY = "#555555"
 GRID = "#dddddd"
 
 
-def new_figure(width: float, height: float) -> Any:
+def new_figure(width: float, height: float, *, layout: Any = None, dpi: int = DPI) -> Any:
     """Make a matplotlib figure of a size in inches, without pyplot and its global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=DPI)
+    figure = Figure(figsize=(width, height), dpi=dpi, layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
@@ -42,8 +43,11 @@ def plain(text: str) -> str:
     return printable(text).replace("$", r"\$")
 
 
-def save(figure: Any, path: Path) -> None:
-    """Write a figure in the format that the suffix names; equal figures give equal bytes."""
+def save(figure: Any, path: Path, **options: Any) -> None:
+    """Write a figure in the format that the suffix names; equal figures give equal bytes.
+
+    ``options`` are for `Figure.savefig`.
+    """
     from matplotlib import rc_context
 
     form = path.suffix.lstrip(".").lower()
@@ -58,7 +62,7 @@ def save(figure: Any, path: Path) -> None:
     _choose_fonts(figure)
     with rc_context(settings), replacing(path) as partial, catch_warnings():
         filterwarnings("ignore", "Glyph .* missing")  # no font here has it: boxes stand for it
-        figure.savefig(partial, format=form, dpi=DPI, **by_format[form])
+        figure.savefig(partial, format=form, **by_format[form], **options)
 
 
 def inline_svg(figure: Any, label: str, titles: Mapping[str, str]) -> Markup:
@@ -107,6 +111,11 @@ def add_legend(figure: Any, entries: Sequence[tuple[str, str]], **place: Any) ->
         columnspacing=1.4,
         **place,
     )
+
+
+def short_name(name: str) -> str:
+    """Shorten a name for a legend."""
+    return shorten(printable(name), 28, placeholder="...") or name[:28]
 
 
 def quiet_axes(axes: Any) -> None:

@@ -97,8 +97,7 @@ def draw_fronts(
 
 def panel_svg(panel: Panel, legend: Mapping[int, tuple[str, str]]) -> Markup:
     """Draw one panel for a page; ``legend``: name and color of each number."""
-    figure = canvas.new_figure(*PAGE_PANEL)
-    figure.set_layout_engine("constrained")
+    figure = canvas.new_figure(*PAGE_PANEL, layout="constrained")
     _draw_panel(figure.add_subplot(), panel, {i: color for i, (_, color) in legend.items()})
     titles = {f"mark-{i}": name for i, (name, _) in legend.items()}
     return canvas.inline_svg(figure, f"{panel.y_label} by {panel.x_label}", titles)

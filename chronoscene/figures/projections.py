@@ -102,7 +102,7 @@ def legend_names(labels: Sequence[str]) -> list[str]:
     if all(label == str(i) for i, label in enumerate(labels)):
         return [f"Period {i}" if len(labels) <= 8 else str(i) for i in range(len(labels))]
     names = [label if label == str(i) else f"{i}: {label}" for i, label in enumerate(labels)]
-    return [shorten(name, 28, placeholder="...") or name[:28] for name in names]
+    return [canvas.short_name(name) for name in names]
 
 
 def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[Plane]) -> int:

@@ -74,21 +74,21 @@ class Timeline:
     def at(self, index: int, progress: float) -> Due:
         """Return what is due at a step; arguments as in `chronoscene.methods.Method.step`."""
         config, moment = self.config, self.moment(progress)
-        # A squeezed schedule jumps over moments, so what counts is that a multiple was passed.
-        passed_reset = moment // config.reset_interval > self.last_moment // config.reset_interval
-        round_is_due = (index + 1) % config.densify_interval == 0
+        resets, resets_before = (m // config.reset_interval for m in (moment, self.last_moment))
+        self.last_moment = moment
         growing = moment < config.densify_until
         adaptive = config.densification == "adaptive"
-        progress = moment / config.schedule_length
-        self.last_moment = moment
+        densify = growing and moment > config.densify_from
+        decay = moment / config.schedule_length  # beyond 1 after the end of the schedule
         return Due(
             moment=moment,
             sh_degree=min(config.sh_degree, moment // config.sh_interval),
-            position_lr=log_linear(progress, config.position_lr_initial, config.position_lr_final),
+            position_lr=log_linear(decay, config.position_lr_initial, config.position_lr_final),
             collect=growing and adaptive,
-            densify=growing and moment > config.densify_from and round_is_due,
+            densify=densify and (index + 1) % config.densify_interval == 0,
             prune_large=moment > config.prune_large_from,
-            reset=growing and adaptive and passed_reset,
+            # A squeezed schedule jumps over moments and may pass a multiple of the interval.
+            reset=growing and adaptive and resets > resets_before,
         )
 
 

@@ -14,9 +14,9 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from chronoscene.bench.files.records import RunRecord
+from chronoscene.bench.files.records import RunRecord, damaged, read_document
 from chronoscene.errors import CheckpointError
 from chronoscene.io.staging import replacing, write_text_atomic
 
@@ -203,19 +203,10 @@ def read_manifest(folder: Path) -> Manifest:
         CheckpointError: If it is missing, damaged, or names a path outside the folder.
     """
     path = folder / MANIFEST
-    try:
-        manifest = Manifest.model_validate_json(path.read_bytes())
-    except FileNotFoundError as error:
-        raise CheckpointError(
-            path, expected="a manifest of images", found="no such file", todo="run bench again"
-        ) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        raise _untrusted(path, f"{first['msg']} ({where})") from error
+    manifest = read_document(path, Manifest, expected="a manifest of images")
     views = [(e.view, e.rendered_period) for e in manifest.images]
     if len(set(views)) != len(views):
-        raise _untrusted(path, "a view twice")
+        raise damaged(path, "a view twice")
     for entry in manifest.images:
         for file in (entry.file, entry.mask_file, entry.changed_file):
             if file is not None:
@@ -275,11 +266,5 @@ def _load_png(
     mode = cv2.IMREAD_COLOR if color else cv2.IMREAD_GRAYSCALE
     image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     if image is None or image.shape[:2] != size:
-        raise _untrusted(path, "an image of another size" if image is not None else "no image")
+        raise damaged(path, "an image of another size" if image is not None else "no image")
     return np.asarray(image, np.uint8)
-
-
-def _untrusted(path: Path, found: str) -> CheckpointError:
-    return CheckpointError(
-        path, expected="what bench wrote", found=found, todo="delete the folder and run bench again"
-    )

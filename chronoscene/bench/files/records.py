@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -38,6 +38,8 @@ PHOTOS = "photos"
 FIGURES = "figures"
 
 Values = dict[str, float]
+Document = TypeVar("Document", bound=BaseModel)
+Line = TypeVar("Line", "CurvePoint", "ViewScore")
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,14 +201,7 @@ def read_run(folder: Path) -> RunRecord:
         CheckpointError: If it is missing or damaged.
     """
     path = folder / RUN_FILE
-    try:
-        return RunRecord.model_validate_json(path.read_bytes())
-    except FileNotFoundError as error:
-        raise CheckpointError(
-            path, expected="a finished run", found="no such file", todo="run bench first"
-        ) from error
-    except ValidationError as error:
-        raise damaged(path, error) from error
+    return read_document(path, RunRecord, expected="a finished run", todo="run bench first")
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -232,40 +227,62 @@ def read_rows(folder: Path) -> list[ViewScore]:
     Raises:
         CheckpointError: If it is missing or damaged.
     """
-    path = folder / ROWS_FILE
+    return read_lines(folder / ROWS_FILE, ViewScore, expected="the rows of a run")
+
+
+def read_lines(path: Path, kind: type[Line], *, expected: str) -> list[Line]:
+    """Read a CSV file with the fields of a dataclass among its columns.
+
+    Raises:
+        CheckpointError: If it is missing or damaged.
+    """
+    types = {"str": str, "int": int, "float": float}
+    columns = [(field.name, types[str(field.type)]) for field in fields(kind)]
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return [_parse_row(line) for line in csv.DictReader(file)]
+            lines = csv.DictReader(file)
+            return [kind(*[convert(line[name]) for name, convert in columns]) for line in lines]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(
             path,
-            expected="the rows of a run",
+            expected=expected,
             found=f"{type(error).__name__}: {error}",
             todo="delete the run and run bench again",
         ) from error
 
 
-def _parse_row(line: Mapping[str, str]) -> ViewScore:
-    return ViewScore(
-        line["view"],
-        int(line["camera_period"]),
-        int(line["rendered_period"]),
-        line["region"],
-        line["metric"],
-        float(line["value"]),
-    )
+def read_document(
+    path: Path,
+    kind: type[Document],
+    *,
+    expected: str,
+    found: str = "no such file",
+    todo: str = "run bench again",
+) -> Document:
+    """Read a JSON file that this package wrote.
+
+    Args:
+        path: The file.
+        kind: Its content.
+        expected: For the message if it is missing, as ``found`` and ``todo``.
+
+    Raises:
+        CheckpointError: If it is missing or damaged.
+    """
+    try:
+        return kind.model_validate_json(path.read_bytes())
+    except FileNotFoundError as error:
+        raise CheckpointError(path, expected=expected, found=found, todo=todo) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the file"
+        raise damaged(path, f"{first['msg']} ({where})") from error
 
 
-def damaged(path: Path, error: ValidationError) -> CheckpointError:
-    """Make the error for a file with a wrong content, with the first problem."""
-    first = error.errors()[0]
-    where = ".".join(map(str, first["loc"])) or "the file"
-    return CheckpointError(
-        path,
-        expected="what bench wrote",
-        found=f"{first['msg']} ({where})",
-        todo="delete the run and run bench again",
-    )
+def damaged(path: Path, found: str) -> CheckpointError:
+    """Make the error for a file that is not as it was written."""
+    todo = "delete its folder and run bench again"
+    return CheckpointError(path, expected="what bench wrote", found=found, todo=todo)
 
 
 def run_folders(runs: Path) -> list[Path]:
@@ -287,10 +304,7 @@ def write_failure(folder: Path, failure: Failure) -> None:
 def read_failure(folder: Path) -> Failure | None:
     """Read the failure of the run in a folder; None if it did not fail."""
     path = folder / FAILURE_FILE
-    try:
-        return Failure.model_validate_json(path.read_bytes()) if path.is_file() else None
-    except ValidationError as error:
-        raise damaged(path, error) from error
+    return read_document(path, Failure, expected="a failure") if path.is_file() else None
 
 
 def _is_final(folder: Path) -> bool:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from chronoscene.bench.files.records import damaged
-from chronoscene.errors import CheckpointError
+from chronoscene.bench.files.records import SOURCE_FILE, read_document
 
 
 class RunSource(BaseModel):
@@ -27,15 +26,16 @@ class RunSource(BaseModel):
     """Similarity transform as a matrix. [4, 4]"""
 
 
-def _read_source(path: Path) -> RunSource:
-    try:
-        return RunSource.model_validate_json(path.read_bytes())
-    except FileNotFoundError as error:
-        raise CheckpointError(
-            path,
-            expected="the scene and method of the run",
-            found="no such file: an earlier version made the run",
-            todo="run bench again with --overwrite",
-        ) from error
-    except ValidationError as error:
-        raise damaged(path, error) from error
+def read_source(folder: Path) -> RunSource:
+    """Read ``source.json`` of a run.
+
+    Raises:
+        CheckpointError: If it is missing or damaged.
+    """
+    return read_document(
+        folder / SOURCE_FILE,
+        RunSource,
+        expected="the scene and method of the run",
+        found="no such file: an earlier version made the run",
+        todo="run bench again with --overwrite",
+    )

@@ -22,7 +22,7 @@ from chronoscene.bench.files.predictions import (
 from chronoscene.bench.files.records import FIGURES, PREDICTIONS, RunRecord
 from chronoscene.bench.report.summary import kind_of
 from chronoscene.bench.report.tables import period_name
-from chronoscene.io.staging import replacing
+from chronoscene.figures import canvas
 from chronoscene.metrics.psnr_ssim import psnr
 
 CELL_WIDTH = 2.6  # Inches per image
@@ -63,15 +63,13 @@ def draw_figures(
 
 
 def by_scene(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
-    """The runs that are shown in pictures: `first_seeds` of each scene."""
-    found: dict[str, list[RunRecord]] = {}
-    for record in records:
-        found.setdefault(record.scene, []).append(record)
-    return {scene: first_seeds(of_scene) for scene, of_scene in found.items()}
+    """Choose the runs that are shown in pictures: `first_seeds` of each scene."""
+    scenes = dict.fromkeys(record.scene for record in records)
+    return {scene: first_seeds([r for r in records if r.scene == scene]) for scene in scenes}
 
 
 def first_seeds(records: Sequence[RunRecord]) -> list[RunRecord]:
-    """The lowest seed of each method, strategy, preset and variant."""
+    """Choose the lowest seed of each method, strategy, preset and variant."""
     chosen: dict[tuple[str, str], RunRecord] = {}
     for record in sorted(records, key=lambda record: record.seed):
         chosen.setdefault((record.method, kind_of(record)), record)
@@ -79,23 +77,21 @@ def first_seeds(records: Sequence[RunRecord]) -> list[RunRecord]:
 
 
 def chosen_views(truth: Path, per_period: int) -> list[ImageEntry]:
-    """Views spread evenly over the test views of each period, in name order."""
-    by_period: dict[int, list[ImageEntry]] = {}
-    for entry in read_manifest(truth).images:
-        by_period.setdefault(entry.camera_period, []).append(entry)
+    """Choose views evenly spread over the test views of each period, in name order."""
+    images = read_manifest(truth).images
     chosen = []
-    for _, entries in sorted(by_period.items()):
+    for period in sorted({image.camera_period for image in images}):
+        entries = [image for image in images if image.camera_period == period]
         count = min(per_period, len(entries))
         chosen += [entries[(2 * i + 1) * len(entries) // (2 * count)] for i in range(count)]
     return chosen
 
 
 def column_of(record: RunRecord) -> ShownRun:
-    """The predictions of a run."""
+    """Read the list of predictions of a run."""
     predictions = record.folder / PREDICTIONS
     entries = {e.view: e for e in read_manifest(predictions).images}
-    title = f"{record.title}\n{kind_of(record)}"
-    return ShownRun(title, predictions, entries)
+    return ShownRun(f"{record.title}\n{kind_of(record)}", predictions, entries)
 
 
 def _draw(
@@ -108,16 +104,12 @@ def _draw(
     *,
     errors: bool,
 ) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     aspect = float(np.mean([entry.height / entry.width for entry in rows]))
-    # Room for a caption under each image, the titles above and the colour bar below; what is left
-    # over is cut off when the figure is saved.
+    # Space for a caption under each image, the titles above and the colour bar below; the rest is
+    # cut off when the figure is saved.
     lines = len(rows) if errors else 2 * len(rows)
     size = (CELL_WIDTH * (1 + len(columns)), (CELL_WIDTH * aspect + 0.3) * lines + 1.2)
-    figure = Figure(figsize=size, layout="compressed", dpi=150)
-    FigureCanvasAgg(figure)
+    figure = canvas.new_figure(*size, layout="compressed", dpi=150)
     axes: Any = figure.subplots(lines, 1 + len(columns), squeeze=False)
     image = None
     for row, entry in zip(np.split(axes, len(rows)), rows, strict=True):
@@ -132,9 +124,7 @@ def _draw(
     what = "error of the test views" if errors else "test views"
     where = "methods differ most" if len(columns) > 1 else "errors are largest"
     figure.suptitle(f"{scene}: {what}; framed: where {where}", fontsize=12)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as partial:
-        figure.savefig(partial, format="png", bbox_inches="tight", pad_inches=0.1)
+    canvas.save(figure, path, bbox_inches="tight", pad_inches=0.1)
 
 
 def _draw_row(
@@ -146,7 +136,7 @@ def _draw_row(
     *,
     errors: bool,
 ) -> Any:
-    """One view: the photo, then each method with its PSNR. Returns the last error map.
+    """Draw the photo, then each method with its PSNR. Returns the last error map.
 
     ``axes`` has a second row for what is enlarged, or one row for error maps.
     """
@@ -177,7 +167,7 @@ def _draw_row(
 
 
 def _frame(window: tuple[slice, slice]) -> Any:
-    """A rectangle around pixels; matplotlib counts from the centre of the first one."""
+    """Make a rectangle around pixels; matplotlib counts from the centre of the first one."""
     from matplotlib.patches import Rectangle
 
     (top, bottom), (left, right) = ((part.start, part.stop) for part in window)
@@ -186,7 +176,7 @@ def _frame(window: tuple[slice, slice]) -> Any:
 
 
 def where_methods_differ(errors: Sequence[NDArray[np.float64]]) -> tuple[slice, slice]:
-    """Rows and columns of the window, `WINDOW` wide and high, that is worth a closer look.
+    """Find the window, `WINDOW` wide and high, that shows most: its rows and columns.
 
     It has the largest sum of the variance of the error between methods, pixel by pixel; with one
     method, of its error.
@@ -208,7 +198,7 @@ def where_methods_differ(errors: Sequence[NDArray[np.float64]]) -> tuple[slice, 
 def psnr_text(
     image: NDArray[np.uint8], photo: NDArray[np.uint8], mask: NDArray[np.bool_] | None
 ) -> str:
-    """PSNR of a view in words; not scored where the mask ignores all of it."""
+    """Format the PSNR of a view; not scored where the mask ignores all of it."""
     if mask is not None and not mask.any():
         return "not scored"
     return f"{psnr(image, photo, mask):.2f} dB"
@@ -217,7 +207,7 @@ def psnr_text(
 def mean_error(
     image: NDArray[np.uint8], photo: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float64]:
-    """Mean absolute error over the channels, 0..1; nan where the mask ignores. [H, W]"""
+    """Average the absolute error over channels, 0..1; NaN where the mask ignores. [H, W]"""
     difference = image.astype(np.float64) - photo.astype(np.float64)
     error = np.abs(difference).mean(axis=2) / 255.0
     return error if mask is None else np.where(mask, error, np.nan)

@@ -37,8 +37,7 @@ def draw_curves(records: Sequence[RunRecord]) -> Curves | None:
     Returns:
         None if nothing was probed.
     """
-    figure = canvas.new_figure(*SIZE)
-    figure.set_layout_engine("constrained")
+    figure = canvas.new_figure(*SIZE, layout="constrained")
     axes = figure.add_subplot(xlabel="training [s]", ylabel="PSNR [dB]")
     canvas.quiet_axes(axes)
     axes.grid(axis="y", color=canvas.GRID, linewidth=0.6)

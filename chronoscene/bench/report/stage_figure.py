@@ -15,7 +15,7 @@ from chronoscene.bench.files.records import FIGURES, RunRecord
 from chronoscene.bench.report.summary import kind_of
 from chronoscene.bench.report.tables import period_name
 from chronoscene.bench.score.forgetting import stage_matrix
-from chronoscene.io.staging import replacing
+from chronoscene.figures import canvas
 from chronoscene.metrics.registry import metric_info
 
 METRICS = ("psnr", "ssim", "lpips_vgg")
@@ -42,10 +42,7 @@ def draw_stages(runs: Path, records: Sequence[RunRecord]) -> list[Path]:
 
 
 def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
-    """One row of heat maps for each metric, one column for each method."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+    """Draw one row of heat maps for each metric, one column for each method."""
     first = next(iter(rows.values()))[0]
     names = [period_name(i, first.period_labels) for i in first.period_labels]
     names = [shorten(name, 20) for name in names]
@@ -53,8 +50,7 @@ def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
     metrics = [metric for metric in METRICS if metric in there]
     side = 1.2 + 0.45 * min(len(names), 2 * WRITTEN)
     size = ((0.6 + side) * len(rows) + 1.0, (0.8 + side) * len(metrics) + 0.6)
-    figure = Figure(figsize=size, layout="constrained", dpi=150)
-    FigureCanvasAgg(figure)
+    figure = canvas.new_figure(*size, layout="constrained", dpi=150)
     axes: Any = figure.subplots(len(metrics), len(rows), squeeze=False)
     for row, metric in zip(axes, metrics, strict=True):
         info = metric_info(metric)
@@ -68,9 +64,7 @@ def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
         figure.colorbar(image, ax=list(row), shrink=0.8, aspect=20)
     title = f"{scene}: test views of each period; below the red line, those of periods seen so far"
     figure.suptitle(title, fontsize=10)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as partial:
-        figure.savefig(partial, format="png", bbox_inches="tight", pad_inches=0.1)
+    canvas.save(figure, path, bbox_inches="tight", pad_inches=0.1)
 
 
 def _draw_matrix(
@@ -81,7 +75,7 @@ def _draw_matrix(
     decimals: int,
     higher_is_better: bool,
 ) -> Any:
-    """One heat map. Its colours are for the trained models of all those ``found``."""
+    """Draw one heat map, in colours for the trained models of all those ``found``."""
     known = np.concatenate([matrix[1:][np.isfinite(matrix[1:])] for matrix in found])
     low, high = known.min(), known.max()
     colors = "viridis" if higher_is_better else "viridis_r"

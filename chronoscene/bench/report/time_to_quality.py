@@ -1,8 +1,7 @@
-"""What training time buys: the PSNR of the probe views after given times, and the reverse."""
+"""Quality by training time: PSNR of the probe views after given times, and the reverse."""
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,11 +12,10 @@ from statistics import mean, stdev
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench.files.records import CURVE_FILE, CurvePoint, RunRecord
+from chronoscene.bench.files.records import CURVE_FILE, CurvePoint, RunRecord, read_lines
 from chronoscene.bench.files.strategies import STRATEGIES
 from chronoscene.bench.report.summary import labelled, with_spread
 from chronoscene.bench.report.tables import ALL_SCENES
-from chronoscene.errors import CheckpointError
 from chronoscene.io.tables import Table
 
 LADDER = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 18000, 36000, 86400)
@@ -55,32 +53,13 @@ def read_curve(folder: Path) -> list[CurvePoint]:
         CheckpointError: If it is damaged.
     """
     path = folder / CURVE_FILE
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return [
-                CurvePoint(
-                    float(line["seconds"]),
-                    int(line["iteration"]),
-                    int(line["primitives"]),
-                    float(line["psnr"]),
-                    int(line["parameters"]),
-                    line["model"],
-                )
-                for line in csv.DictReader(file)
-            ]
-    except FileNotFoundError:
+    if not path.is_file():
         return []
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(
-            path,
-            expected="the curve of a run",
-            found=f"{type(error).__name__}: {error}",
-            todo="delete the run and run bench again",
-        ) from error
+    return read_lines(path, CurvePoint, expected="the curve of a run")
 
 
 def whole_curve(points: Sequence[CurvePoint], strategy: str) -> Curve | None:
-    """The curve of a run; None where its probes are not of one set of views.
+    """Combine the probes of a run in one curve; None if they are not of one set of views.
 
     The models of ``separate`` count as if they were trained by turns: at each probe their seconds
     are added up and their PSNR is averaged. The stages of ``sequential`` probe other views each.
@@ -97,12 +76,12 @@ def whole_curve(points: Sequence[CurvePoint], strategy: str) -> Curve | None:
 
 
 def psnr_after(curve: Curve, seconds: float) -> float:
-    """PSNR at a time, linear between probes; NaN before the first and after the last."""
+    """Return the PSNR at a time, linear between probes; NaN before the first and after the last."""
     return float(np.interp(seconds, curve[0], curve[1], left=math.nan, right=math.nan))
 
 
 def seconds_until(curve: Curve, psnr: float) -> float:
-    """When a PSNR is reached first, linear between probes; NaN if it never is.
+    """Return when a PSNR is reached first, linear between probes; NaN if it never is.
 
     What the first probe has already was reached by then at the latest: its time is returned.
     """
@@ -115,7 +94,7 @@ def seconds_until(curve: Curve, psnr: float) -> float:
 
 
 def curve_values(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -> list[CurveValue]:
-    """All that curves give, by device, scene and configuration; what a seed lacks is left out.
+    """Read numbers off curves by device, scene and configuration; what a seed lacks is left out.
 
     Args:
         records: Runs of any scenes.
@@ -145,7 +124,7 @@ def curve_values(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -
 
 
 def psnr_levels(curves: Sequence[Curve]) -> list[float]:
-    """Whole dB that some probe reached, at most `MAX_LEVELS` at equal distances."""
+    """List whole dB that some probe reached, at most `MAX_LEVELS` at equal distances."""
     values = np.concatenate([curve[1] for curve in curves])
     low, high = math.ceil(values.min()), math.floor(values.max())
     step = max(1, math.ceil((high - low + 1) / MAX_LEVELS))
@@ -175,7 +154,7 @@ def _of_seeds(
 
 
 def _over_scenes(single: Sequence[CurveValue], scenes: int) -> Iterator[CurveValue]:
-    """Means over scenes of what is known for all of them."""
+    """Average over scenes the numbers that are known for all of them."""
     parts: dict[tuple[str, str, float | None], list[CurveValue]] = {}
     for value in single:
         key = value.label, value.quantity, value.at
@@ -189,7 +168,7 @@ def _over_scenes(single: Sequence[CurveValue], scenes: int) -> Iterator[CurveVal
 
 
 def time_tables(found: Sequence[CurveValue]) -> list[Table]:
-    """For each device and scene: PSNR after times, and times until PSNR levels."""
+    """Make tables for each device and scene: PSNR after times, and times until PSNR levels."""
     made = []
     for device, scene in dict.fromkeys((value.device, value.scene) for value in found):
         part = [r for r in found if (r.device, r.scene) == (device, scene)]
@@ -207,7 +186,7 @@ def time_tables(found: Sequence[CurveValue]) -> list[Table]:
 
 
 def _table(title: str, part: Sequence[CurveValue], quantity: str, more: dict[str, str]) -> Table:
-    """Configurations by what a quantity was asked for at, and more columns."""
+    """Put configurations in rows, places of a quantity and further quantities in columns."""
     columns = {(quantity, r.at) for r in part if r.quantity == quantity}
     ordered: list[tuple[str, float | None]] = sorted(columns, key=lambda column: column[1] or 0)
     spell = in_time if quantity == "psnr" else "{:g} dB".format
@@ -226,7 +205,7 @@ def _text(value: CurveValue) -> str:
 
 
 def in_time(seconds: float) -> str:
-    """``30 s``, ``2 min``, ``1 h``."""
+    """Format seconds as ``30 s``, ``2 min`` or ``1 h``."""
     for unit, length in (("h", 3600), ("min", 60)):
         if seconds >= length:
             return f"{seconds / length:g} {unit}"

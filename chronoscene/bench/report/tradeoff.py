@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -36,37 +36,22 @@ BUDGET_TOLERANCE = 0.05
 """Share by which a training may exceed a time and still count as one that took it: a budget ends it
 after the step in which it runs out."""
 ANY_DEVICE = ""
+FRONT_COLUMNS = (
+    *("scene", "device", "metric", "cost", "label", "method", "strategy", "preset", "variant"),
+    *("quality", "quality_sd", "value", "value_sd", "n", "on_front"),
+)
+"""Columns of `front_points`, one row per configuration and panel.
 
-
-@dataclass(frozen=True, slots=True)
-class FrontPoint:
-    """One configuration in one panel: the mean of a metric and of a cost over its seeds."""
-
-    scene: str
-    """Or `ALL_SCENES`."""
-    device: str
-    """Empty for costs other than `TIMES`, to which runs of all devices belong."""
-    metric: str
-    cost: str
-    """In the unit of `RunRecord`."""
-    label: str
-    method: str
-    strategy: str
-    preset: str
-    variant: str
-    quality: float
-    quality_sd: float | None
-    """Sample standard deviation over the seeds; None for one."""
-    value: float
-    """Of the cost."""
-    value_sd: float | None
-    n: int
-    on_front: bool
-    """Whether no other configuration of the panel is as good for less, or better for as much."""
+``scene`` may be `ALL_SCENES`; ``device`` is empty for costs other than `TIMES`, to which runs of
+all devices belong; ``quality`` is the mean of the metric and ``value`` that of the cost over ``n``
+seeds, in the unit of `RunRecord`, each with its sample standard deviation, None for one seed;
+``on_front`` is True if no other configuration of the panel is as good for less, or better for as
+much.
+"""
 
 
 def as_configurations(records: Sequence[RunRecord]) -> list[RunRecord]:
-    """Runs whose variant says the width of their images, where it is not the usual one.
+    """Add the width of the images to the variants of runs, where it is not the usual one.
 
     They have no rows: intervals over views are not asked for.
     """
@@ -79,7 +64,7 @@ def as_configurations(records: Sequence[RunRecord]) -> list[RunRecord]:
 
 
 def entries_by_device(records: Sequence[RunRecord]) -> dict[str, DataFrame]:
-    """What `summarise` says of the runs of each device, and under `ANY_DEVICE` of all.
+    """Summarise the runs of each device, and under `ANY_DEVICE` all runs.
 
     Where there are several scenes, their mean is one more, `ALL_SCENES`.
     """
@@ -94,50 +79,52 @@ def entries_by_device(records: Sequence[RunRecord]) -> dict[str, DataFrame]:
     return found
 
 
-def front_points(records: Sequence[RunRecord]) -> list[FrontPoint]:
-    """Every configuration in every panel, by scene, metric, cost and device, the cheapest first."""
+def front_points(records: Sequence[RunRecord]) -> DataFrame:
+    """Tabulate all panels by scene, metric, cost and device, with the cheapest first in each.
+
+    Returns:
+        `FRONT_COLUMNS`.
+    """
+    import pandas as pd
+
     metrics = [name for name in metric_names(records) if name in PAPER_METRICS]
-    found: list[FrontPoint] = []
-    for device, entries in entries_by_device(records).items():
-        for scene, part in entries.groupby("scene", sort=False):
-            for metric in metrics:
-                for cost in DRAWN_COSTS:
-                    if (device != ANY_DEVICE) == (cost in TIMES):
-                        found += _panel(part, str(scene), device, metric, cost)
-    scenes = list(dict.fromkeys(point.scene for point in found))
-    found.sort(
-        key=lambda p: (scenes.index(p.scene), metrics.index(p.metric), DRAWN_COSTS.index(p.cost))
+    panels = [
+        _panel(part, device, metric, cost)
+        for device, entries in entries_by_device(records).items()
+        for _, part in entries.groupby("scene", sort=False)
+        for metric in metrics
+        for cost in DRAWN_COSTS
+        if (device != ANY_DEVICE) == (cost in TIMES)
+    ]
+    panels = [panel for panel in panels if len(panel)]
+    points = pd.concat(panels) if panels else pd.DataFrame(columns=FRONT_COLUMNS)
+    orders = {"scene": points.scene.unique().tolist(), "metric": metrics, "cost": DRAWN_COSTS}
+    return points.sort_values(
+        list(orders), key=lambda names: names.map(orders[names.name].index), ignore_index=True
     )
-    return found
 
 
-def _panel(
-    entries: DataFrame, scene: str, device: str, metric: str, cost: str
-) -> Iterator[FrontPoint]:
+def _panel(entries: DataFrame, device: str, metric: str, cost: str) -> DataFrame:
+    """Compare the configurations on one scene and device."""
     quality = entries[(entries.quantity == metric) & (entries.column == "macro")]
-    costs = entries[(entries.quantity == cost) & (entries.column == "")]
+    costs = entries[(entries.quantity == cost) & (entries.column == "")][["label", "mean", "sd"]]
     both = quality.merge(costs, on="label", suffixes=("", "_of_cost")).sort_values("mean_of_cost")
     sign = 1.0 if metric_info(metric).higher_is_better else -1.0
-    best = on_front(both.mean_of_cost.to_numpy(), sign * both["mean"].to_numpy())
-    for row, is_best in zip(both.to_dict("records"), best, strict=True):
-        several = row["n"] > 1
-        yield FrontPoint(
-            scene=scene,
-            device=device,
-            metric=metric,
-            cost=cost,
-            **{name: row[name] for name in ("label", "method", "strategy", "preset", "variant")},
-            quality=row["mean"],
-            quality_sd=row["sd"] if several else None,
-            value=row["mean_of_cost"],
-            value_sd=row["sd_of_cost"] if several else None,
-            n=row["n"],
-            on_front=bool(is_best),
-        )
+    both = both.assign(
+        device=device,
+        metric=metric,
+        cost=cost,
+        quality=both["mean"],
+        quality_sd=both.sd.astype(object).where(both.n > 1, None),
+        value=both.mean_of_cost,
+        value_sd=both.sd_of_cost.astype(object).where(both.n > 1, None),
+        on_front=on_front(both.mean_of_cost.to_numpy(), sign * both["mean"].to_numpy()),
+    )
+    return both[[*FRONT_COLUMNS]]
 
 
 def on_front(costs: NDArray[np.float64], quality: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether no other point is as good for less, or better for as much. [N]
+    """Find the points to which no other one is as good for less, or better for as much. [N]
 
     Args:
         costs: Less is better. [N]
@@ -148,45 +135,29 @@ def on_front(costs: NDArray[np.float64], quality: NDArray[np.float64]) -> NDArra
     return np.logical_not((no_worse & better).any(axis=0))
 
 
-def front_tables(points: Sequence[FrontPoint]) -> list[Table]:
-    """The fronts, a table for each scene and metric."""
-    panels: dict[tuple[str, str], dict[tuple[str, str], list[FrontPoint]]] = {}
-    for point in points:
-        if point.on_front:
-            of_scene = panels.setdefault((point.scene, point.metric), {})
-            of_scene.setdefault((point.cost, point.device), []).append(point)
+def front_tables(points: DataFrame) -> list[Table]:
+    """Make a table of the fronts for each scene and metric."""
     made = []
-    for (scene, metric), fronts in panels.items():
+    fronts = points[points.on_front.astype(bool)]
+    for (scene, metric), of_metric in fronts.groupby(["scene", "metric"], sort=False):
         rows, breaks = [], []
-        for (cost, device), front in fronts.items():
+        for (cost, device), front in of_metric.groupby(["cost", "device"], sort=False):
             what = " on ".join(filter(None, (COST_TITLES[cost], device)))
-            rows += [
-                [
-                    "" if number else what,
-                    point.label,
-                    with_spread(cost, point.value, point.value_sd),
-                    with_spread(metric, point.quality, point.quality_sd),
-                ]
-                for number, point in enumerate(front)
-            ]
+            for number, point in enumerate(front.itertuples()):
+                value = with_spread(cost, point.value, point.value_sd)
+                quality = with_spread(metric, point.quality, point.quality_sd)
+                rows.append(["" if number else what, point.label, value, quality])
             breaks.append(len(rows) - 1)
-        title = metric_info(metric).title
-        heads = [(head, "") for head in ("against", "method", "cost", title)]
-        made.append(
-            Table(
-                heads,
-                rows,
-                labels=2,
-                title=f"{scene}: Pareto fronts of {title} ({metric})",
-                breaks=breaks[:-1],
-            )
-        )
+        name = metric_info(metric).title
+        heads = [(head, "") for head in ("against", "method", "cost", name)]
+        title = f"{scene}: Pareto fronts of {name} ({metric})"
+        made.append(Table(heads, rows, labels=2, title=title, breaks=breaks[:-1]))
     return made
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a configuration must keep to; None for what does not matter."""
+    """Limits of a configuration; None for no limit."""
 
     seconds: float | None = None
     """On the training clock."""
@@ -196,7 +167,7 @@ class Limits:
     """To be reached, in dB."""
 
     def excess(self, found: dict[str, Any]) -> float:
-        """The largest ratio to a limit, of mean squared errors for PSNR; at most 1 if all are kept.
+        """Return the largest ratio to a limit (of mean squared errors for PSNR), at most 1 if kept.
 
         Args:
             found: Mean ``seconds``, `SIZE` and ``psnr`` of a configuration.
@@ -212,7 +183,7 @@ class Limits:
 
 
 def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[str]:
-    """A sentence for each scene and device: the configuration to use within limits.
+    """Name the configuration to use within limits, in a sentence for each scene and device.
 
     It is the best one in PSNR; where a PSNR is to be reached, the one that is trained in the least
     time.
@@ -257,7 +228,7 @@ def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[st
 
 
 def _configurations(entries: DataFrame) -> list[dict[str, Any]]:
-    """What is known of each configuration on a scene: names, and means of what limits are for."""
+    """List names and means of each configuration on a scene that has all limited quantities."""
     quantities = ("psnr", "seconds", SIZE)
     found = []
     for _, part in entries.groupby("label", sort=False):

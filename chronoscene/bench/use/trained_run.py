@@ -16,13 +16,12 @@ from chronoscene.bench.files.provenance import scene_hash
 from chronoscene.bench.files.records import (
     CHECKPOINT,
     PREDICTIONS,
-    SOURCE_FILE,
     STAGES,
     RunRecord,
     read_config,
     read_run,
 )
-from chronoscene.bench.files.source import RunSource, _read_source
+from chronoscene.bench.files.source import RunSource, read_source
 from chronoscene.bench.files.strategies import STRATEGIES, Strategy, period_part
 from chronoscene.bench.score.views import PredictedView, read_views
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
@@ -344,7 +343,7 @@ def open_run(
             found=f"no folder {CHECKPOINT}",
             todo="open a run that bench trained, with its checkpoint",
         )
-    source = _read_source(folder / SOURCE_FILE)
+    source = read_source(folder)
     for path in filter(None, (plugin_path, source.plugin_path)):
         if str(path) not in sys.path:
             sys.path.append(str(path))

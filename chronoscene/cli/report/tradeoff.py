@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,7 +21,7 @@ from chronoscene.bench.report.time_to_quality import (
     whole_curve,
 )
 from chronoscene.bench.report.tradeoff import (
-    FrontPoint,
+    FRONT_COLUMNS,
     Limits,
     as_configurations,
     choose,
@@ -39,8 +38,10 @@ from chronoscene.cli.output import (
     writing_to,
 )
 from chronoscene.errors import ConfigError
-from chronoscene.io import tables
 from chronoscene.metrics.registry import metric_info
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 FIGURE = "tradeoff.png"
 
@@ -93,7 +94,7 @@ def command(
     curves = [whole_curve(read_curve(run.folder), run.strategy) for run in records]
     points, times = front_points(records), curve_values(records, curves)
     emit(_text(points, times, _notes(records, failures), style, out), out)
-    if points:
+    if len(points):
         figure = (figures or folders[0] / FIGURES) / FIGURE
         with writing_to("--figures", figure):
             draw(points, figure, records)
@@ -128,27 +129,23 @@ def _notes(records: Sequence[RunRecord], failures: Sequence[Failure]) -> list[st
 
 
 def _text(
-    points: Sequence[FrontPoint],
-    times: Sequence[CurveValue],
-    notes: list[str],
-    style: str,
-    out: Path | None,
+    points: DataFrame, times: Sequence[CurveValue], notes: list[str], style: str, out: Path | None
 ) -> str:
     """Return everything but the figure, in one of the formats."""
     if style == "csv":
-        rows = [list(asdict(point).values()) for point in points]
-        return tables.csv_text([field.name for field in fields(FrontPoint)], rows)
+        return str(points.to_csv(columns=FRONT_COLUMNS, index=False, lineterminator="\n"))
     if style == "json":
         from pydantic import ConfigDict, TypeAdapter
 
-        document: dict[str, Any] = {"fronts": points, "times": times, "notes": notes}
+        fronts = points.to_dict("records")
+        document: dict[str, Any] = {"fronts": fronts, "times": times, "notes": notes}
         adapter = TypeAdapter(dict[str, Any], config=ConfigDict(ser_json_inf_nan="strings"))
         return adapter.dump_json(document, indent=1).decode() + "\n"
     made = [*front_tables(points), *time_tables(times)]
     return tables_text(made, notes, style, width=terminal_width(out))
 
 
-def draw(points: Sequence[FrontPoint], path: Path, records: Sequence[RunRecord]) -> None:
+def draw(points: DataFrame, path: Path, records: Sequence[RunRecord]) -> None:
     """Draw all panels of some points; a row for each scene and metric.
 
     Args:
@@ -158,26 +155,21 @@ def draw(points: Sequence[FrontPoint], path: Path, records: Sequence[RunRecord])
     """
     from chronoscene.figures.fronts import Panel, draw_fronts
 
-    names = list(dict.fromkeys(point.label for point in points))
-    numbers = {name: i + 1 for i, name in enumerate(names)}
-    groups: dict[str, dict[int, None]] = {}
-    panels: dict[tuple[str, str], dict[tuple[str, str], list[FrontPoint]]] = {}
-    for point in points:
-        groups.setdefault(point.method, {})[numbers[point.label]] = None
-        row = panels.setdefault((point.scene, point.metric), {})
-        row.setdefault((point.cost, point.device), []).append(point)
+    names = points.label.unique().tolist()
+    points = points.assign(number=[names.index(label) + 1 for label in points.label])
+    groups = points.groupby("method", sort=False).number.unique().map(list).to_dict()
     rows = [
         [
             Panel(
                 title=" on ".join(filter(None, (scene, device))),
-                x_label=_axis(cost),
+                x_label="rendering [images/s]" if cost == "render_seconds" else COST_TITLES[cost],
                 y_label=metric_info(metric).title,
-                marks=[_mark(point, numbers[point.label]) for point in found],
+                marks=[_mark(point) for point in panel.itertuples()],
                 lower_is_better=not metric_info(metric).higher_is_better,
             )
-            for (cost, device), found in row.items()
+            for (cost, device), panel in row.groupby(["cost", "device"], sort=False)
         ]
-        for (scene, metric), row in panels.items()
+        for (scene, metric), row in points.groupby(["scene", "metric"], sort=False)
     ]
     devices = "; ".join(dict.fromkeys(run.device for run in records))
     commits = ", ".join(dict.fromkeys(run.commit for run in records))
@@ -186,16 +178,11 @@ def draw(points: Sequence[FrontPoint], path: Path, records: Sequence[RunRecord])
         "Bars: standard deviation over seeds."
         f"\nDevice: {devices}. Code: {commits}."
     )
-    draw_fronts(rows, path, names=names, groups={k: list(v) for k, v in groups.items()}, note=note)
+    draw_fronts(rows, path, names=names, groups=groups, note=note)
 
 
-def _axis(cost: str) -> str:
-    if cost == "render_seconds":
-        return "rendering [images/s]"
-    return COST_TITLES[cost]
-
-
-def _mark(point: FrontPoint, number: int) -> Any:
+def _mark(point: Any) -> Any:
+    """Place a row of `front_points`, with its ``number``, in a panel."""
     from chronoscene.figures.fronts import Mark
 
     factor = next(known.factor for known in COSTS if known.name == point.cost)
@@ -203,4 +190,4 @@ def _mark(point: FrontPoint, number: int) -> Any:
     if point.cost == "render_seconds":
         x = 1 / point.value
         spread = x * (point.value_sd or 0.0) / point.value  # to first order
-    return Mark(number, x, point.quality, spread, point.quality_sd or 0.0, point.on_front)
+    return Mark(point.number, x, point.quality, spread, point.quality_sd or 0.0, point.on_front)

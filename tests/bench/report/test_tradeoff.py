@@ -30,7 +30,7 @@ def on(points, cost, scene="plaza", device=None):
     """Labels on the front of PSNR in one panel, the cheapest first."""
     return [
         p.method
-        for p in points
+        for p in points.itertuples()
         if (p.cost, p.metric, p.scene) == (cost, "psnr", scene)
         and p.on_front
         and device in (None, p.device)
@@ -48,7 +48,7 @@ def test_fronts_of_runs():
     points = front_points(RUNS)
     assert on(points, "seconds") == on(points, "checkpoint_bytes") == ["quick", "slow"]
     assert on(points, "render_seconds") == ["slow"]
-    assert {p.cost for p in points if p.device} == {"seconds", "render_seconds"}
+    assert {*points[points.device != ""].cost} == {"seconds", "render_seconds"}
 
 
 def test_where_less_is_better_the_front_turns():
@@ -56,18 +56,16 @@ def test_where_less_is_better_the_front_turns():
     for r, value in zip(runs, (0.5, 0.25), strict=True):
         for values in (*r.aggregates.values(), *r.periods.values()):
             values["lpips_vgg_3dgs"] = value
-    lpips = [p for p in front_points(runs) if p.metric == "lpips_vgg_3dgs" and p.cost == "seconds"]
-    assert [p.on_front for p in lpips] == [True, True]
-    psnr = [p for p in front_points(runs) if p.metric == "psnr" and p.cost == "seconds"]
-    assert [p.on_front for p in psnr] == [True, False]
+    fronts = front_points(runs).query("cost == 'seconds'").groupby("metric").on_front
+    assert fronts.agg(list).to_dict() == {"lpips_vgg_3dgs": [True, True], "psnr": [True, False]}
 
 
 def test_seeds_are_averaged():
     seeds = [run("m", 20.0, 10.0), run("m", 22.0, 14.0, seed=1)]
-    point = next(p for p in front_points(seeds) if p.cost == "seconds")
+    (point,) = front_points(seeds).query("cost == 'seconds'").itertuples()
     assert (point.quality, point.value, point.n) == (21.0, 12.0, 2)
     assert point.quality_sd == pytest.approx(2**0.5) and point.value_sd == pytest.approx(8**0.5)
-    assert next(iter(front_points(RUNS))).quality_sd is None
+    assert front_points(RUNS).quality_sd[0] is None
 
 
 def test_times_of_devices_are_not_compared_but_sizes_are():
@@ -81,9 +79,9 @@ def test_times_of_devices_are_not_compared_but_sizes_are():
 def test_the_mean_over_scenes_has_what_ran_on_all():
     quay = {"scene": "quay", "scene_hash": "q"}
     runs = [*RUNS[:2], run("quick", 24.0, 7.0, **quay), run("bad", 30.0, 1.0, **quay)]
-    found = [p for p in front_points(runs) if (p.scene, p.cost) == (ALL_SCENES, "seconds")]
-    assert [(p.method, p.quality, p.value) for p in found] == [("quick", 22.0, 6.0)]
-    assert not [p for p in front_points(RUNS) if p.scene == ALL_SCENES]
+    found = front_points(runs).query("scene == @ALL_SCENES and cost == 'seconds'")
+    assert found[["method", "quality", "value"]].to_numpy().tolist() == [["quick", 22.0, 6.0]]
+    assert ALL_SCENES not in {*front_points(RUNS).scene}
 
 
 def test_the_table_has_the_front_alone():
