@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -23,7 +22,7 @@ from chronoscene.scene.cameras import (
 from chronoscene.scene.geometry import camera_centre, rotation_from_quaternion
 from chronoscene.validation import rule
 from chronoscene.validation.folder.observations import good_poses
-from chronoscene.validation.folder.scene_folder import RawScene, derived
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
 
 VISIBLE = 0.5  # Pixels; distortion that moves no pixel this far may be dropped instead of undone
@@ -184,61 +183,6 @@ def rigs_partial(scene: RawScene, model: RawModel) -> Iterator[Hit]:
 
 
 @rule.error(
-    "CS142",
-    bad="`frames.bin` of an earlier run, with images that are not in `images.bin`",
-    remedy="write all five files again together, or delete rigs and frames: then each image is "
-    "its own frame",
-    needs=("cameras", "images"),
-)
-def rigs_inconsistent(scene: RawScene, model: RawModel) -> Iterator[Hit]:
-    """Rigs, frames, cameras and images refer to something that does not exist, or an image is in no
-    frame or in two frames."""
-    place = f"{scene.model_place or '.'}/frames{_form(model)}"
-    for expected, wrong in _contradictions(scene).items():
-        if wrong:
-            yield Hit(place, expected, shown(sorted(wrong)), count=len(wrong))
-
-
-@derived
-def _contradictions(scene: RawScene) -> dict[str, set[str]]:
-    """Map the expected references of rigs and frames to those that are broken."""
-    raw = scene.model.rigs if scene.model else None
-    if raw is None or scene.images is None or scene.cameras is None:
-        return {}
-    cameras = {camera.camera_id for camera in scene.cameras}
-    images = dict(zip(scene.images.ids.tolist(), scene.images.names, strict=True))
-    camera_of = dict(zip(images, scene.images.camera_ids.tolist(), strict=False))
-    taken = Counter(i for frame in raw.frames for (kind, _), i in frame.data if kind == CAMERA)
-    return {
-        "rigs of cameras in the model": {
-            f"camera {i} of rig {rig}"
-            for rig, sensors in raw.rigs.items()
-            for kind, i in sensors
-            if kind == CAMERA and i not in cameras
-        },
-        "frames of existing rigs": {
-            f"rig {f.rig_id} of frame {f.frame_id}" for f in raw.frames if f.rig_id not in raw.rigs
-        },
-        "frames with the sensors of their rig": {
-            f"sensor {sensor[1]} of frame {f.frame_id}"
-            for f in raw.frames
-            for sensor, _ in f.data
-            if f.rig_id in raw.rigs and sensor not in raw.rigs[f.rig_id]
-        },
-        "frames with images of the model": {f"image {i}" for i in taken if i not in images},
-        "each image in exactly one frame": {
-            f"{images[i]} in {counted(taken[i], 'frame')}" for i in images if taken[i] != 1
-        },
-        "frames whose images have the camera of the sensor": {
-            images[i]
-            for frame in raw.frames
-            for sensor, i in frame.data
-            if sensor[0] == CAMERA and camera_of.get(i, sensor[1]) != sensor[1]
-        },
-    }
-
-
-@rule.error(
     "CS143",
     bad="poses transformed in `images.bin` only, with `frames.bin` left as it was",
     remedy="write the model again with COLMAP, or delete rigs and frames if the poses in images "
@@ -248,8 +192,8 @@ def rig_pose_differs(scene: RawScene, model: RawModel, images: RawImages) -> Ite
     """The pose of an image in `images` differs from the pose given by its frame and rig. COLMAP
     reads the frames, older readers read the images, so they see two different scenes."""
     raw = model.rigs
-    if raw is None or not len(images) or any(_contradictions(scene).values()):
-        return  # no rigs, or those of another model
+    if raw is None or not len(images):
+        return
     row = {image_id: i for i, image_id in enumerate(images.ids.tolist())}
     good = good_poses(images)
     triples = [

@@ -10,6 +10,7 @@ from collections.abc import Hashable, Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import shown
@@ -17,7 +18,7 @@ from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation import rule
 from chronoscene.validation.checks.reprojection import typical_depth
 from chronoscene.validation.folder.grouping import grouped
-from chronoscene.validation.folder.pixels import THUMBNAIL, Pixels
+from chronoscene.validation.folder.pixels import Pixels
 from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import Hit
 
@@ -36,7 +37,6 @@ FEATURELESS = 4.0  # Standard deviation of a thumbnail below which it looks like
 ROUNDING = 1.01  # Margin by which pairs pass to the exact comparison
 MAX_TRIED = 8  # Images compared pixel by pixel with one that looks like all of them
 
-_BLOCK = 8
 _ROWS = 256
 
 
@@ -141,20 +141,15 @@ def near_pairs(
 ) -> Iterator[tuple[str, str, float]]:
     """Pairs of images of different roles whose thumbnails differ by less than `MAX_DIFFERENCE`.
 
-    Pairs of equal pixels are left out. The difference of block means never exceeds that of the
-    pixels, so most pairs are settled with a sixty-fourth of the numbers. For each image there is at
-    most one pair with a later image: thousands of frames of a fixed camera must not yield millions
-    of pairs.
+    Pairs of equal pixels are left out. For each image there is at most one pair with a later image:
+    thousands of frames of a fixed camera must not yield millions of pairs.
     """
     kept = {n: p.thumbnail for n, p in pixels.items() if p.thumbnail is not None}
     names = [n for n, thumbnail in kept.items() if thumbnail.std(axis=(0, 1)).max() >= FEATURELESS]
     if len(names) < 2:
         return
     full = np.stack([np.ravel(kept[n]) for n in names])
-    side = THUMBNAIL // _BLOCK
-    blocks = full.reshape(len(names), side, _BLOCK, side, _BLOCK, 3).mean(axis=(2, 4))
-    table = blocks.reshape(len(names), -1)
-    table = table - table.mean(axis=0)  # smaller numbers have smaller rounding errors below
+    table = full - full.mean(axis=0)  # smaller numbers have smaller rounding errors below
     norms = (table * table).sum(axis=1)
     _, group = np.unique([repr(role[n]) for n in names], return_inverse=True)
     for first in range(0, len(names), _ROWS):
@@ -186,15 +181,12 @@ def twins(
     ``places`` [N, 3] are camera centres, in one place up to a distance of ``near``; ``rotations``
     are [N, 3, 3]; ``periods`` [N] are negative for none; ``test`` [N] is true for test images.
     """
-    order = np.argsort(places[:, 0], kind="stable")
-    x = places[order, 0]
+    tree = cKDTree(places)
     for i in np.flatnonzero(test & (periods >= 0)).tolist():
-        begin = np.searchsorted(x, places[i, 0] - near)
-        others = order[begin : np.searchsorted(x, places[i, 0] + near, "right")]
+        others = np.sort(np.array(tree.query_ball_point(places[i], near), np.int64))
         others = others[(periods[others] == periods[i]) & ~test[others]]
-        close = np.linalg.norm(places[others] - places[i], axis=1) <= near
         turned = np.linalg.norm(rotations[others] - rotations[i], axis=(1, 2))
-        if len(alike := others[close & (turned <= SAME_DIRECTION)]):
+        if len(alike := others[turned <= SAME_DIRECTION]):
             yield i, int(alike[0])
 
 
