@@ -9,6 +9,10 @@ A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and wher
   COLMAP model: so the validator can look at that model as it is. Then `detect` looks for the model,
   and the functions are ``matches(path, model)`` and ``read(path, model=..., ...)``;
 - ``remarks(path)``, which lists what of a folder does not become part of the scene.
+
+All raise a `SceneError` for a damaged scene, ``write`` also for a folder that is in use and for
+missing images; a `ConfigError` for a ``period_by`` that is not in ``PERIOD_BY``. What ``write``
+writes appears complete or not at all.
 """
 
 from __future__ import annotations

@@ -49,9 +49,6 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
     Args:
         path: Folder of the scene.
         model: Its COLMAP model, where that was read before.
-
-    Raises:
-        SceneError: If files are missing, damaged, or contradict each other.
     """
     path = Path(path)
     entries, problems = splits.parse_split_text(read_text(path / SPLIT))
@@ -194,16 +191,13 @@ def read_world(path: Path) -> WorldFrame:
 def write(
     scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
-    """Write a scene in this format; the folder appears complete or not at all.
+    """Write a scene in this format.
 
     Args:
         scene: Any scene, of whatever format.
         out: Folder that does not exist yet, or is empty.
         image_source: What to do with the images; see `IMAGE_SOURCES`.
         progress: Called after each image.
-
-    Raises:
-        SceneError: If ``out`` is in use, or an image is missing.
     """
     out = Path(out)
     for frame in scene.frames:

@@ -59,23 +59,14 @@ def _is_level(path: Path) -> bool:
 
 
 def read(path: Path, *, period_by: str = "step", model: FoundModel | None = None) -> Scene:
-    """Read a scene.
-
-    Raises:
-        SceneError: If it is damaged.
-        ConfigError: If ``period_by`` is not in `PERIOD_BY`, or the change is not there.
-    """
+    """Read a scene."""
     if (path / TRAIN).exists():
         return _read_level(path, period_by)
     return colmap_layout.read_scene(path, model, partial(assign, period_by=period_by), NAME)
 
 
 def assign(images: Path, names: list[str], *, period_by: str = "step") -> colmap_layout.Assigned:
-    """Periods and test images of a real scene by the names of the images.
-
-    Raises:
-        ConfigError: If ``period_by`` is not ``step``.
-    """
+    """Periods and test images of a real scene by the names of the images."""
     if period_by != "step":
         raise rule_error(period_by, ["step"])
     steps = {name: _step(name) for name in names}
@@ -146,13 +137,9 @@ def remarks(path: Path) -> list[str]:
 def write(
     scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
-    """Write a real scene for the loader of CL-Splats; it appears complete or not at all.
+    """Write a real scene for the loader of CL-Splats.
 
     Images are directly in ``images/``, and their names begin with ``day_<period>_``.
-
-    Raises:
-        SceneError: If ``out`` is in use, an image is missing or its camera is not a pinhole,
-            or names without their folders are equal.
     """
     return colmap_layout.write_renamed(
         scene.with_frames([replace(f, camera=_readable(f.camera)) for f in scene.frames]),

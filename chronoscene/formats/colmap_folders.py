@@ -43,22 +43,12 @@ def matches(path: Path, model: FoundModel | None) -> bool:
 
 
 def read(path: Path, *, period_by: str = "folder", model: FoundModel | None = None) -> Scene:
-    """Read a scene.
-
-    Raises:
-        SceneError: If it is damaged, or images are not in folders.
-        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
-    """
+    """Read a scene."""
     return colmap_layout.read_scene(path, model, partial(assign, period_by=period_by), NAME)
 
 
 def assign(images: Path, names: list[str], *, period_by: str = "folder") -> colmap_layout.Assigned:
-    """Assign periods by the names of the images, or by another rule.
-
-    Raises:
-        SceneError: If an image has no period.
-        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
-    """
+    """Assign periods by the names of the images, or by another rule."""
     kind = period_by.partition(":")[0]
     if period_by.startswith(grouping.TABLE):
         grouped = grouping.group_by_table(names, Path(period_by.removeprefix(grouping.TABLE)))
@@ -110,13 +100,10 @@ def _dates(images: Path, names: list[str]) -> dict[str, date]:
 def write(
     scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
-    """Write a scene in this format; the folder appears complete or not at all.
+    """Write a scene in this format.
 
     Images go to the folder of their period. It is named after the period's label where labels are
     names of folders in the order of the periods, else after its id and label.
-
-    Raises:
-        SceneError: If ``out`` is in use, or an image is missing.
     """
     return colmap_layout.write_renamed(
         scene,

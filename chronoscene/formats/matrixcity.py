@@ -86,12 +86,7 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path, *, period_by: str | None = None) -> Scene:
-    """Read a scene.
-
-    Raises:
-        SceneError: If a file is damaged, or images have no poses.
-        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
-    """
+    """Read a scene."""
     path = Path(path)
     cameras = CameraTable()
     images: dict[str, PosedImage] = {}

@@ -74,12 +74,7 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path, *, period_by: str | None = None) -> Scene:
-    """Read a scene.
-
-    Raises:
-        SceneError: If the file is damaged or contradicts itself.
-        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
-    """
+    """Read a scene."""
     path = Path(path)
     place = path / FILE
     data = read_json_document(place)
@@ -298,14 +293,11 @@ def _to_original(path: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
 def write(
     scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
-    """Write a scene in this format; the folder appears complete or not at all.
+    """Write a scene in this format.
 
     Each frame has its ``period``, and ``time`` = period / (T - 1) for loaders of dynamic scenes.
     Labels, dates and the world frame go to the extra keys ``periods`` and ``world``. Tracks and ids
     of points have no place in this format.
-
-    Raises:
-        SceneError: If ``out`` is in use, an image is missing, or the format lacks a camera model.
     """
     out = Path(out)
     for frame in scene.frames:

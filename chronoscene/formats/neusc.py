@@ -50,12 +50,7 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path, *, period_by: str = "year") -> Scene:
-    """Read a scene.
-
-    Raises:
-        SceneError: If it is damaged, or a name has no date.
-        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
-    """
+    """Read a scene."""
     path = Path(path)
     model, _ = _read_images(path)
     used = _used_names(path, model)

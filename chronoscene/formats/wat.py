@@ -51,20 +51,12 @@ def matches(path: Path, model: FoundModel | None) -> bool:
 
 
 def read(path: Path, *, model: FoundModel | None = None) -> Scene:
-    """Read a scene.
-
-    Raises:
-        SceneError: If it is damaged, or images are not in folders.
-    """
+    """Read a scene."""
     return colmap_layout.read_scene(path, model, assign, NAME)
 
 
 def assign(images: Path, names: list[str]) -> colmap_layout.Assigned:
-    """Assign periods and test images by the names of the images.
-
-    Raises:
-        SceneError: If an image is in no folder.
-    """
+    """Assign periods and test images by the names of the images."""
     tasks = {name: _task(images, name) for name in names}
     grouped = group_labels(tasks, list(dict.fromkeys(tasks[name] for name in sorted(tasks))))
     return colmap_layout.Assigned(grouped, default_tests(grouped[0]), DEFAULT_RULE)
@@ -85,14 +77,11 @@ def _task(images: Path, name: str) -> str:
 def write(
     scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
-    """Write a scene for the loader of CLNeRF; the folder appears complete or not at all.
+    """Write a scene for the loader of CLNeRF.
 
     Each period becomes a task: a folder directly in ``images/``, named after the label where the
     alphabetical order of the labels is that of the periods, else after id and label. The loader
     uses the size and intrinsics of camera 1 for all images, so there must be only one camera.
-
-    Raises:
-        SceneError: If ``out`` is in use, an image is missing, or cameras differ.
     """
     camera = _one_camera(scene, out)
     return colmap_layout.write_renamed(

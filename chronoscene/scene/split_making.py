@@ -155,16 +155,6 @@ def _check(settings: SplitSettings) -> None:
         raise ConfigError(place, expected=expected, found=str(found), todo="give another value")
 
 
-STRATEGIES: Mapping[Strategy, Callable[[Scene, SplitSettings, Times], set[str]]] = {
-    "stratified": lambda scene, s, _: stratified(scene, s.fraction, s.offset, s.seed),
-    "blocked": lambda scene, s, _: blocked(scene, s.fraction, s.blocks, s.seed or 0),
-    "date": lambda scene, s, times: latest(scene, s.fraction, times),
-    "periods": lambda scene, s, _: whole_periods(scene, s.periods),
-    "none": lambda scene, s, _: set(),
-}
-"""Functions that choose the test images of a scene, by name of the strategy."""
-
-
 def _distances(scene: Scene, *, same_period: bool) -> tuple[float, float] | None:
     """Median and smallest distance from a test camera to the nearest training camera."""
     groups = [p.id for p in scene.periods] if same_period else [None]
@@ -178,28 +168,28 @@ def _distances(scene: Scene, *, same_period: bool) -> tuple[float, float] | None
     return (float(np.median(found)), float(np.min(found))) if found else None
 
 
-def stratified(scene: Scene, fraction: float, offset: int, seed: int | None) -> set[str]:
-    """One image of each run of ``1 / fraction`` images in name order, in every period.
+def stratified(scene: Scene, settings: SplitSettings, times: Times) -> set[str]:
+    """Choose one image of each run of ``1 / fraction`` images in name order, in every period.
 
     The image is the one at ``offset`` in its run, or with a seed a random one.
     """
-    rng = None if seed is None else np.random.default_rng(seed)
-    length = 1 / fraction
+    rng = None if settings.seed is None else np.random.default_rng(settings.seed)
+    fraction, length = settings.fraction, 1 / settings.fraction
     tests = set()
     for period in scene.periods:
         frames = scene.select(period=period.id)
         for run in range(math.ceil(len(frames) * fraction - 1e-9)):
             first = math.floor(run * length + 1e-9)
             last = min(len(frames), math.floor((run + 1) * length + 1e-9))
-            index = first + offset if rng is None else int(rng.integers(first, last))
+            index = first + settings.offset if rng is None else int(rng.integers(first, last))
             if index < len(frames):
                 tests.add(frames[index].name)
     return tests
 
 
-def whole_periods(scene: Scene, periods: tuple[int, ...]) -> set[str]:
-    """All images of the periods held out."""
-    known = {period.id for period in scene.periods}
+def whole_periods(scene: Scene, settings: SplitSettings, times: Times) -> set[str]:
+    """Choose all images of the periods held out."""
+    known, periods = {period.id for period in scene.periods}, settings.periods
     if not periods or not set(periods) <= known:
         raise ConfigError(
             "--period",
@@ -210,10 +200,10 @@ def whole_periods(scene: Scene, periods: tuple[int, ...]) -> set[str]:
     return {f.name for f in scene.frames if f.period in periods}
 
 
-def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set[str]:
-    """The images of whole blocks of camera positions; by default, two blocks are for testing."""
+def blocked(scene: Scene, settings: SplitSettings, times: Times) -> set[str]:
+    """Choose the images of whole blocks of camera positions; by default, of two blocks."""
     centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
-    count = blocks or max(2, round(2 / fraction))
+    count = settings.blocks or max(2, round(2 / settings.fraction))
     if count > len(centres):
         raise ConfigError(
             "--blocks",
@@ -222,16 +212,16 @@ def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set
             todo="ask for fewer blocks (--blocks)",
         )
     block = cut_into_blocks(centres, count)
-    wanted = max(1, round(fraction * count))
-    chosen = choose_blocks(block, scene.frame_periods, wanted, seed)
+    wanted = max(1, round(settings.fraction * count))
+    chosen = choose_blocks(block, scene.frame_periods, wanted=wanted, seed=settings.seed or 0)
     return {f.name for f, b in zip(scene.frames, block.tolist(), strict=True) if b in chosen}
 
 
 def cut_into_blocks(centres: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Block of each camera; blocks are boxes in space with equally many cameras.
+    """Cut the cameras into blocks: boxes in space with equally many cameras. [N, 3] -> [N]
 
     The cameras are split recursively across the longest side of their bounding box, in proportion
-    to the number of blocks on either side. [N, 3] -> [N]
+    to the number of blocks on either side.
     """
     block = np.zeros(len(centres), np.int64)
 
@@ -252,9 +242,9 @@ def cut_into_blocks(centres: NDArray[np.float64], count: int) -> NDArray[np.int6
 
 
 def choose_blocks(
-    block: NDArray[np.int64], periods: NDArray[np.int64], wanted: int, seed: int
+    block: NDArray[np.int64], periods: NDArray[np.int64], *, wanted: int, seed: int
 ) -> set[int]:
-    """Blocks for testing: first those that give most periods their first test image.
+    """Choose blocks for testing: first those that give most periods their first test image.
 
     Ties are broken by a random order. No block is taken that would leave a period without
     training images. More than ``wanted`` are taken only while a period has no test image.
@@ -280,8 +270,8 @@ def choose_blocks(
     return chosen
 
 
-def latest(scene: Scene, fraction: float, times: Times) -> set[str]:
-    """The last images of each period, as close to the fraction as whole days allow."""
+def latest(scene: Scene, settings: SplitSettings, times: Times) -> set[str]:
+    """Choose the last images of each period, as close to the fraction as whole days allow."""
     taken = {name: time for name, time in times.items() if time is not None}
     if lost := [f.name for f in scene.frames if f.name not in taken]:
         raise SceneError(
@@ -296,7 +286,7 @@ def latest(scene: Scene, fraction: float, times: Times) -> set[str]:
         frames = scene.select(period=period.id)
         ordered = sorted(frames, key=lambda f: (taken[f.name], f.name))
         days = [taken[f.name].date() for f in ordered]
-        wanted = fraction * len(ordered)
+        wanted = settings.fraction * len(ordered)
         # The held-out images begin with a day, except where there is only one.
         starts = [i for i in range(1, len(days)) if days[i] != days[i - 1]]
         if starts:
@@ -305,3 +295,13 @@ def latest(scene: Scene, fraction: float, times: Times) -> set[str]:
             start = len(days) - max(1, round(wanted))
         tests |= {f.name for f in ordered[start:]}
     return tests
+
+
+STRATEGIES: Mapping[Strategy, Callable[[Scene, SplitSettings, Times], set[str]]] = {
+    "stratified": stratified,
+    "blocked": blocked,
+    "date": latest,
+    "periods": whole_periods,
+    "none": lambda scene, settings, times: set(),
+}
+"""Functions that choose the test images of a scene, by name of the strategy."""

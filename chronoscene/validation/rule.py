@@ -192,13 +192,13 @@ class PeriodSummary:
 class Summary:
     """Counts of the content of a scene; None for parts that cannot be read."""
 
-    images: int | None
-    cameras: int | None
-    points: int | None
-    observations: int | None
-    image_files: int
+    images: int | None = None
+    cameras: int | None = None
+    points: int | None = None
+    observations: int | None = None
+    image_files: int = 0
     """Files in ``images/``, registered or not."""
-    periods: tuple[PeriodSummary, ...]
+    periods: tuple[PeriodSummary, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,8 +56,6 @@ class ReadOptions:
 
 DETECT = ReadOptions()
 
-UNKNOWN = Summary(None, None, None, None, 0, ())
-
 
 def find_folders(path: Path) -> list[Path]:
     """The folder itself if it looks like a scene, else its subfolders that do, sorted.
@@ -222,7 +220,7 @@ def _validate(scene: RawScene, rules: Sequence[Rule]) -> SceneReport:
     try:
         summary = _summarise(scene)
     except Exception:  # the rules that need the same part report it
-        summary = UNKNOWN
+        summary = Summary()
     findings.sort(key=lambda f: (SEVERITIES.index(f.severity), f.code))
     skipped.sort(key=lambda s: s.code)
     return SceneReport(printable(scene.name), scene.root, summary, tuple(findings), tuple(skipped))
@@ -259,7 +257,7 @@ def lost_report(path: Path) -> SceneReport:
     """The report on a scene whose process died."""
     todo = "if memory ran out, check this scene by itself; otherwise report the bug"
     finding = _failure(".", "a scene that can be checked", "one whose checking process died", todo)
-    return SceneReport(printable(path.resolve().name), path, UNKNOWN, (finding,), ())
+    return SceneReport(printable(path.resolve().name), path, Summary(), (finding,), ())
 
 
 def _summarise(scene: RawScene) -> Summary:
@@ -275,7 +273,14 @@ def _summarise(scene: RawScene) -> Summary:
         total, test = images[period], tests[period] if scene.tests is not None else None
         train = None if test is None else total - test
         in_periods.append(
-            PeriodSummary(period, total, train, test, medians.get(period), labels.get(period))
+            PeriodSummary(
+                period,
+                images=total,
+                train=train,
+                test=test,
+                reprojection_px=medians.get(period),
+                label=labels.get(period),
+            )
         )
     return Summary(
         images=None if scene.images is None else len(scene.images),

@@ -154,7 +154,7 @@ def test_of_two_days_as_near_to_the_fraction_the_later_one_begins_the_test(tmp_p
     taken = {f"{i}.jpg": datetime(2020, 1, day, 8 + i) for i, day in enumerate(days)}
     put_images(tmp_path, taken)
     scene = make_scene([0] * 4, root=tmp_path, names=list(taken))
-    assert latest(scene, 0.5, times_of(scene)) == {"3.jpg"}
+    assert latest(scene, SplitSettings("date", 0.5), times_of(scene)) == {"3.jpg"}
 
 
 def test_last_hours_of_a_day(tmp_path):
@@ -170,8 +170,13 @@ def test_last_days_of_each_period(tmp_path):
     taken |= {f"b{i}.jpg": datetime(2021, 1, 1, 20 - i) for i in range(4)}
     put_images(tmp_path, taken)
     scene = make_scene([0] * 9 + [1] * 4, root=tmp_path, names=list(taken))
-    assert latest(scene, 0.25, times_of(scene)) == {"a6.jpg", "a7.jpg", "a8.jpg", "b0.jpg"}
-    many = latest(scene, 0.6, times_of(scene))
+    assert latest(scene, SplitSettings("date", 0.25), times_of(scene)) == {
+        "a6.jpg",
+        "a7.jpg",
+        "a8.jpg",
+        "b0.jpg",
+    }
+    many = latest(scene, SplitSettings("date", 0.6), times_of(scene))
     assert {name for name in many if name[0] == "a"} == {f"a{i}.jpg" for i in range(3, 9)}
 
 
@@ -179,7 +184,7 @@ def test_dates_in_file_names(tmp_path):
     names = ["2009-08-31_a.jpg", "20090901_b.jpg", "c.jpg"]
     put_images(tmp_path, dict.fromkeys(names[:2]) | {"c.jpg": datetime(2009, 9, 3)})
     scene = make_scene([0] * 3, root=tmp_path, names=names)
-    assert latest(scene, 0.3, times_of(scene)) == {"c.jpg"}
+    assert latest(scene, SplitSettings("date", 0.3), times_of(scene)) == {"c.jpg"}
 
 
 @pytest.mark.parametrize("name", ["IMG_1.jpg", "2009-13-01.jpg", "202001011.jpg"])
@@ -243,7 +248,7 @@ def test_every_period_keeps_training_images(pairs, wanted, seed):
     used = sorted({b for b, _ in pairs})
     block = np.array([used.index(b) for b, _ in pairs])
     periods = np.array([p for _, p in pairs])
-    chosen = choose_blocks(block, periods, wanted, seed)
+    chosen = choose_blocks(block, periods, wanted=wanted, seed=seed)
     is_test = np.isin(block, list(chosen))
     assert set(periods[~is_test]) == set(periods)
 
