@@ -49,7 +49,7 @@ _TEXT: dict[str, Any] = {
     "first_round": "at",
     "prune_by": "gradient",
 }
-"""What the paper's text says where the released code does otherwise. The text prints lengths of
+"""Options as in the paper's text where the released code does otherwise. The text prints lengths of
 16, 16 and 32, which cannot be added: here all are 32. Offsets and scales stay in units of their
 anchors, as the text names none."""
 

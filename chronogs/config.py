@@ -13,7 +13,7 @@ from chronoscene.errors import ConfigError
 
 @dataclass(frozen=True)
 class ChronoGSConfig(AnchorConfig):
-    """Where paper and official code differ, the option names both and defaults to the code."""
+    """Options of ChronoGS; those in which paper and code differ name both."""
 
     period_dim: NonNegativeInt = 16
     """Length of an anchor's feature per period (d_v); 0: without local changes."""

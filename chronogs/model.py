@@ -1,4 +1,4 @@
-"""What ChronoGS adds to anchors: features that vary with the period, and how they are fused.
+"""Model of ChronoGS: anchors with features that vary with the period, and their fusion.
 
 With e(t) the period weights (one-hot for a whole period t, see `periods`), an anchor i has at t
 

@@ -34,7 +34,7 @@ MIN_WEIGHT = 1e-3
 
 
 def bake(model: AnchorModel, period_weights: Tensor, views: Sequence[View]) -> GaussianCloud:
-    """The Gaussians that some views show, whatever their number of views.
+    """Make static Gaussians of what some views show.
 
     Args:
         model: What is decoded.
@@ -76,7 +76,7 @@ def bake(model: AnchorModel, period_weights: Tensor, views: Sequence[View]) -> G
 
 
 def _seen(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tensor, Splats, Tensor]:
-    """What a view shows: numbers of Gaussians, the Gaussians, and their weights, on the CPU. [L]"""
+    """Return the Gaussians that a view shows: numbers, Gaussians, weights, on the CPU. [L]"""
     rows, splats, weights = weigh(model, period_weights, view)
     seen = weights > 0
     kept = Splats(*(value[seen].cpu() for value in splats))

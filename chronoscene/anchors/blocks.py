@@ -1,4 +1,4 @@
-"""Which anchors have features of their own for a period, and which share one block between periods.
+"""Blocks: features of anchors for a period, or shared between periods.
 
 In ChronoGS all anchors have a block for each period. Here those that are alike may become one once
 growth is over, and the training goes on with what is left. To move a block by d raises the loss L
@@ -34,12 +34,12 @@ _FORGET = 0.9  # What counts of earlier views after a round
 
 
 def own_blocks(count: int, periods: int) -> Tensor:
-    """Rows of blocks that nobody shares, anchor by anchor. int64 [count, T]"""
+    """Return rows of blocks that are not shared, anchor by anchor. int64 [count, T]"""
     return torch.arange(count * periods).view(count, periods)
 
 
 def leaders(block_rows: Tensor) -> Tensor:
-    """First of the periods that have the same block. int64 [A, T] -> int64 [A, T]"""
+    """Return the first of the periods with the same block. int64 [A, T] -> int64 [A, T]"""
     numbers = torch.arange(block_rows.shape[1], device=block_rows.device).expand_as(block_rows)
     count = int(block_rows.max()) + 1 if block_rows.numel() else 0
     first = numbers.new_full((count,), block_rows.shape[1])
@@ -48,7 +48,7 @@ def leaders(block_rows: Tensor) -> Tensor:
 
 
 def pack_blocks(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Blocks anchor by anchor, and who shares them instead of their rows.
+    """Order blocks by anchor, and replace their rows by the periods that share them.
 
     Returns:
         tensors: ``block_leaders`` uint8 [A, T] in place of ``block_rows``: the first of the periods
@@ -85,12 +85,12 @@ def unpack_blocks(tensors: dict[str, Tensor], periods: int) -> dict[str, Tensor]
 
 
 def _leads(first: Tensor) -> Tensor:
-    """Whether a period is the first that has its block. bool [A, T]"""
+    """Return True for periods that are the first to have their block. bool [A, T]"""
     return first == torch.arange(first.shape[1], device=first.device)
 
 
 class BlockStatistics(AnchorCounters):
-    """How much the loss depends on the blocks, by anchor and period."""
+    """Statistics of how much the loss depends on the blocks, by anchor and period."""
 
     names = ("rise", "drawn", "off")
 
@@ -99,7 +99,7 @@ class BlockStatistics(AnchorCounters):
         """Sums of w; views in which the anchor draws something, and in which all of its Gaussians
         are switched off. [A, T]"""
         self.views = torch.zeros((), dtype=torch.float64)
-        """All views."""
+        """Views of each period."""
 
     def update(
         self,
@@ -128,7 +128,7 @@ class BlockStatistics(AnchorCounters):
         self.views += 1
 
     def fade(self) -> None:
-        """Forget a part of what was: the model was another."""
+        """Forget a part of earlier views: the model was another."""
         for counter in (self.rise, self.drawn, self.off, self.views):
             counter *= _FORGET
 

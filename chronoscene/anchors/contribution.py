@@ -1,6 +1,6 @@
-"""What anchors and their offsets add to images, and which of them carry nothing.
+"""Contributions of anchors and their offsets to images, and those that carry nothing.
 
-What a Gaussian adds to a view is its weight, summed over the pixels. Not in the papers of
+A Gaussian adds its weight to a view, summed over the pixels. Not in the papers of
 Scaffold-GS and ChronoGS, which prune anchors by their opacity: behind others, or too small to be
 seen, an anchor may be as opaque as it likes.
 """
@@ -20,7 +20,7 @@ from chronoscene.training.views import downscale_view
 
 
 def blending_weights(splats: Splats, view: View, layout: AnchorLayout) -> Tensor:
-    """What Gaussians add to a view, in pixels. [L]"""
+    """Sum the weights of Gaussians over the pixels of a view. [L]"""
     everywhere = torch.ones(view.height, view.width, 3, device=splats.means.device)
     return weights_in(
         splats, view, everywhere, near_plane=layout.near_plane, antialiased=layout.antialiased
@@ -28,7 +28,7 @@ def blending_weights(splats: Splats, view: View, layout: AnchorLayout) -> Tensor
 
 
 def weigh(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tensor, Splats, Tensor]:
-    """The Gaussians that a view decodes: their numbers, anchor * k + offset, and weights. [L]"""
+    """Decode the Gaussians of a view; return numbers, anchor * k + offset, and weights. [L]"""
     k, (centre, visible) = model.layout.offsets, model.seen_from(view)
     splats, places = model.decode_active(period_weights, centre, visible)
     numbers = visible[places // k] * k + places % k
@@ -36,7 +36,7 @@ def weigh(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tenso
 
 
 def least(amounts: Tensor, share: float) -> Tensor:
-    """The smallest amounts, as many as make up no more than a share of their sum. bool, as given"""
+    """Return True for the smallest amounts, which make up no more than a share of their sum."""
     values, order = amounts.flatten().double().sort(stable=True)
     found = torch.zeros_like(order, dtype=torch.bool)
     found[order] = values.cumsum(0) <= share * values.sum()
@@ -47,7 +47,7 @@ def least(amounts: Tensor, share: float) -> Tensor:
 def used_offsets(
     model: AnchorModel, views: Sequence[TrainingView], feature_rows: Sequence[int], share: float
 ) -> Tensor:
-    """Offsets that some period needs.
+    """Find the offsets that some period needs.
 
     In each period, the anchors that add least are not needed, as many as add no more than the share
     of what all add to the views of the period; nor are the offsets that add least. Views count at

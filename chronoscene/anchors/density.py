@@ -1,5 +1,5 @@
-"""Where anchors are: one per occupied voxel of the sparse cloud of all periods at first, then
-density control by statistics of the views: where new anchors appear, which ones are pruned.
+"""Places of anchors: at first one per occupied voxel of the sparse cloud of all periods, then
+density control by statistics of the views, by which anchors grow and are pruned.
 
 Source: Scaffold-GS (Lu et al., CVPR 2024), section 3.3, and the official code of Scaffold-GS and
 ChronoGS; differences from the papers are named options of `AnchorConfig`. Everything is on arrays
@@ -28,7 +28,7 @@ MIN_DISTANCE = 1e-7
 
 
 def cell_indices(positions: Tensor, size: float) -> Tensor:
-    """Cell of each position: the nearest multiple of ``size``, halves to even.
+    """Return the cell of each position: the nearest multiple of ``size``, halves to even.
 
     [P, 3] -> int64 [P, 3]
     """
@@ -36,7 +36,7 @@ def cell_indices(positions: Tensor, size: float) -> Tensor:
 
 
 def pack_cells(cells: Tensor) -> Tensor:
-    """One integer per cell, equal exactly where the cells are equal. int64 [P, 3] -> int64 [P]
+    """Pack cells into integers, equal exactly where the cells are. int64 [P, 3] -> int64 [P]
 
     Keys of different calls are not comparable: pack everything that is compared in one call.
     """
@@ -53,19 +53,19 @@ def pack_cells(cells: Tensor) -> Tensor:
 
 
 def neighbour_distances(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Root mean square distance to the three nearest other points, at least `MIN_DISTANCE`. [P]"""
+    """Compute the RMS distance to the three nearest points, at least `MIN_DISTANCE`. [P]"""
     return np.maximum(rms_spacing(points), MIN_DISTANCE)
 
 
 def median_spacing(points: NDArray[np.floating]) -> float:
-    """Median distance of a point to its nearest other point; 1 for a lone point."""
+    """Compute the median distance of points to their nearest other; 1 for a lone point."""
     return float(max(np.median(rms_spacing(points, 1)), MIN_DISTANCE)) if len(points) > 1 else 1.0
 
 
 def resolve_voxel_size(
     points: NDArray[np.floating], value: float, unit: str, *, training_from_world: float
 ) -> float:
-    """Voxel edge in training units.
+    """Compute the voxel edge in training units.
 
     Args:
         points: Sparse points in the training frame. [P, 3]
@@ -84,7 +84,7 @@ def resolve_voxel_size(
 def voxelize(
     points: NDArray[np.floating], size: float, origin: str = "zero"
 ) -> NDArray[np.float32]:
-    """Occupied voxels as positions, sorted by cell. [P, 3] -> [A, 3]
+    """Find the occupied voxels as positions, sorted by cell. [P, 3] -> [A, 3]
 
     Args:
         points: [P, 3]
@@ -100,7 +100,7 @@ def voxelize(
 def initial_anchors(
     points: NDArray[np.floating], size: float, *, origin: str = "zero", limit: int = 0
 ) -> tuple[NDArray[np.float32], float]:
-    """Anchors of a cloud, with a coarser voxel where there would be more than ``limit``.
+    """Place anchors in a cloud, with a coarser voxel if there would be more than ``limit``.
 
     Returns:
         anchors: [A, 3]
@@ -114,7 +114,7 @@ def initial_anchors(
 
 
 def initial_log_scales(anchors: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Log of the neighbour distance, in all six columns. [A, 3] -> [A, 6]"""
+    """Compute the log of the neighbour distance, in all six columns. [A, 3] -> [A, 6]"""
     column = np.log(neighbour_distances(anchors)).astype(np.float32)
     return np.repeat(column[:, None], 6, axis=1)
 
@@ -125,7 +125,7 @@ class AnchorCounters:
     names: ClassVar[tuple[str, ...]]
 
     def state(self) -> dict[str, Tensor]:
-        """All arrays, by name."""
+        """Return all arrays, by name."""
         return {name: getattr(self, name) for name in self.names}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
@@ -146,7 +146,7 @@ class AnchorCounters:
 
 
 class DensityStatistics(AnchorCounters):
-    """What training views said about each anchor and Gaussian since it was last judged."""
+    """Statistics of training views for each anchor and Gaussian since it was last judged."""
 
     names = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
 
@@ -198,7 +198,7 @@ class DensityStatistics(AnchorCounters):
         half_width: float,
         half_height: float,
     ) -> None:
-        """`_accumulate` in plain torch."""
+        """Do what `_accumulate` does in plain torch."""
         k = self.hits.shape[1]
         row = positions // k
         place = visible[row] * k + positions % k
@@ -247,7 +247,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
 
 
 class AnchorRows(NamedTuple):
-    """What has one row per anchor."""
+    """Tensors with one row per anchor."""
 
     anchors: Tensor
     """Positions in training units. [A, 3]"""
@@ -260,7 +260,7 @@ class AnchorRows(NamedTuple):
 
 
 def min_visits(config: AnchorConfig) -> float:
-    """Views of an anchor since the last round above which it is judged; half for a Gaussian."""
+    """Return the views above which an anchor is judged in a round; half for a Gaussian."""
     return config.density_interval * config.success_threshold
 
 
@@ -311,7 +311,7 @@ def grow(
 
 
 def _new_in_level(model: AnchorRows, chosen: Tensor, occupied: Tensor, size: float) -> AnchorRows:
-    """One anchor per cell that holds a chosen Gaussian and no anchor yet."""
+    """Make one anchor per cell that holds a chosen Gaussian and no anchor yet."""
     parent, slot = chosen.nonzero(as_tuple=True)
     reach = devices.exp(model.log_scales[parent, :3])
     centres = model.anchors[parent] + model.offsets[parent, slot] * reach
@@ -340,7 +340,7 @@ def _take(anchors: AnchorRows, rows: slice | Tensor) -> AnchorRows:
 
 
 def prune_mask(statistics: DensityStatistics, config: AnchorConfig) -> Tensor:
-    """Anchors that stay; counters of the anchors that were judged are zeroed. bool [A]"""
+    """Return True for anchors that stay; zero the counters of those that were judged. bool [A]"""
     judged = statistics.visits > min_visits(config)
     faint = statistics.opacity_sum < config.min_opacity * statistics.visits
     still = statistics.motion < config.prune_gradient * statistics.visits

@@ -1,4 +1,4 @@
-"""What methods with anchors have in common as plug-ins."""
+"""Base class of the methods with anchors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from chronoscene.training.points import finite_rows
 
 
 class AnchorMethod(SplattingMethod):
-    """Base of the methods; a subclass names itself and says what its layout and model add."""
+    """Base class of methods with anchors; a subclass has a name, a layout and a model."""
 
     primitive = "anchors"
     model_class: ClassVar[type[AnchorModel]] = AnchorModel
@@ -39,20 +39,20 @@ class AnchorMethod(SplattingMethod):
     trainer: AnchorTrainer | None
 
     def layout(self, train: TrainingSet) -> AnchorLayout:
-        """Sizes and rules of the model."""
+        """Return the sizes and rules of the model."""
         return AnchorLayout.of(self.config, train.num_periods)
 
     @property
     def merge_share(self) -> float:
-        """See `AnchorTrainer`."""
+        """Share by which the loss may rise where periods come to share blocks; 0: none."""
         return 0.0
 
     def feature_rows(self, train: TrainingSet) -> NDArray[np.int64]:
-        """Which of the features that vary each training view has; here that of its period. [V]"""
+        """Return the row of the varying features of each training view; here its period. [V]"""
         return np.array([view.period for view in train.views])
 
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
-        """Start and end of the learning rate of every tensor, by its name in the model."""
+        """Return start and end of the learning rate of every tensor, by its name in the model."""
         config, (start, end) = self.config, self.config.offset_lr
         rates = {
             "offsets": (start * camera_extent, end * camera_extent),
@@ -65,28 +65,30 @@ class AnchorMethod(SplattingMethod):
         return rates
 
     def weights(self, period: float) -> NDArray[np.float32]:
-        """Weights of the features that vary; here by their periods. [T]"""
+        """Return the weights of the varying features; here by their periods. [T]"""
         return period_weights(period, self.num_periods)
 
     def extended_table(self, table: Tensor, count: int) -> Tensor:
-        """Global features for another training set; here those of a new period are copies of the
-        last one's. [R, G] -> [count, G]"""
+        """Extend global features to another training set. [R, G] -> [count, G]
+
+        Here those of a new period are copies of the last one's.
+        """
         return with_new_periods(table, count)
 
     def restored_tensors(
         self, stored: dict[str, Tensor], layout: AnchorLayout
     ) -> dict[str, Tensor]:
-        """Inverse of `stored_tensors`."""
+        """Unpack what `stored_tensors` packed."""
         return unpack_blocks(unpack_offsets(stored, layout.offsets), layout.num_periods)
 
     @property
     def model(self) -> AnchorModel:
-        """The tensors, up to date; there are none before `setup` or `load`."""
+        """Tensors, up to date; there are none before `setup` or `load`."""
         return self._model if self.trainer is None else self.trainer.snapshot()
 
     @property
     def num_periods(self) -> int:
-        """Of the model; asks for no tensors, which `model` brings up to date at every use."""
+        """Number of periods; asks for no tensors, which `model` brings up to date at every use."""
         return self._model.layout.num_periods
 
     def start(self, train: TrainingSet, *, seed: int, device: str) -> AnchorTrainer:

@@ -60,7 +60,7 @@ class AnchorLayout:
     global_dim: int = 0
     hidden_dim: int = 32
     fusion: str = "concat"
-    """How the MLPs get the features: ``concat``, side by side; ``sum``: see `chronogs.model`."""
+    """Input of the MLPs: ``concat``, features side by side; ``sum``: see `chronogs.model`."""
     direction: str = "unit"
     global_heads: tuple[str, ...] = HEADS
     """MLPs that see the global feature."""
@@ -70,7 +70,7 @@ class AnchorLayout:
 
     @classmethod
     def of(cls, config: AnchorConfig, num_periods: int) -> AnchorLayout:
-        """Layout of a config: takes over the options that have the name of a field."""
+        """Make the layout of a config: take over the options that have the name of a field."""
         names = [f.name for f in dataclasses.fields(cls) if hasattr(config, f.name)]
         layout = cls(
             num_periods=num_periods,
@@ -111,12 +111,12 @@ class AnchorModel:
     offsets: Tensor
     """[A, k, 3]"""
     features: Tensor
-    """What all periods share. [A, Fb]"""
+    """Features that all periods share. [A, Fb]"""
     blocks: Tensor
     """Features that vary: one or more for each anchor. [R, Fv]"""
     block_rows: Tensor
-    """Which block an anchor has at a period; no two anchors share one. int64 [A, T], or [A, 0]
-    where nothing but the global feature varies."""
+    """Block of an anchor at a period; no two anchors share one. int64 [A, T], or [A, 0] where
+    nothing but the global feature varies."""
     log_scales: Tensor
     """Columns 0..2 for the offsets, 3..5 for the Gaussians. [A, 6]"""
     global_features: Tensor
@@ -124,7 +124,7 @@ class AnchorModel:
     heads: Mapping[str, HeadWeights]
     """Two-layer MLPs by name; ``w1`` holds only the inputs that the MLP sees."""
     used_offsets: Tensor | None = None
-    """Bit j says whether an anchor uses its offset j; None if all do. int64 [A]"""
+    """Bits of the offsets that an anchor uses; None if it uses all. int64 [A]"""
 
     def __len__(self) -> int:
         return len(self.anchors)
@@ -141,8 +141,8 @@ class AnchorModel:
         anchors: NDArray[np.float32],
         generator: torch.Generator,
     ) -> Self:
-        """The model before training. Draws the heads first, so equal layouts start equal."""
-        heads = {}
+        """Make the model before training. Draws the heads first, so equal layouts start equal."""
+        heads: dict[str, HeadWeights] = {}
         for name in HEADS:
             inputs, outputs = cls.input_dim(layout, name), _OUTPUTS[name] * layout.offsets
             heads[name] = draw_mlp(inputs, layout.hidden_dim, outputs, generator)
@@ -168,7 +168,7 @@ class AnchorModel:
         return model
 
     def _switched_on(self) -> HeadWeights:
-        """The opacity MLP, turned round where it would begin with all Gaussians off.
+        """Return the opacity MLP, turned round if it would begin with all Gaussians off.
 
         All features of a new model are alike, mostly zero. By chance, the opacities of all offsets
         are negative then, seen from most sides, and what is switched off never learns: of a
@@ -184,11 +184,11 @@ class AnchorModel:
 
     @classmethod
     def global_start(cls, config: AnchorConfig) -> str:
-        """How global features start, see `draw_start`; here like any embedding."""
+        """Return the start of global features, see `draw_start`; here that of any embedding."""
         return "gaussian"
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that is stored, by name."""
+        """Return everything that is stored, by name."""
         named = {name: getattr(self, name) for name in _TENSORS}
         for name, head in self.heads.items():
             named |= {f"{name}.{layer}": getattr(head, layer) for layer in LAYERS}
@@ -198,13 +198,15 @@ class AnchorModel:
 
     @classmethod
     def from_tensors(cls, layout: AnchorLayout, tensors: Mapping[str, Tensor]) -> Self:
-        """Inverse of `tensors`."""
-        heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in HEADS}
+        """Make the model from what `tensors` returned."""
+        heads: dict[str, HeadWeights] = {
+            h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in HEADS
+        }
         named = {name: tensors[name] for name in _TENSORS}
         return cls(layout, **named, heads=heads, used_offsets=tensors.get("used_offsets"))
 
     def to(self, device: str | torch.device) -> Self:
-        """The same model on another device."""
+        """Return the same model on another device."""
         moved = {name: tensor.to(device) for name, tensor in self.tensors().items()}
         return self.from_tensors(self.layout, moved)
 
@@ -216,22 +218,22 @@ class AnchorModel:
         return self
 
     def visible(self, view: View) -> Tensor:
-        """Anchors that a view can see, ascending. int64 [M]"""
+        """Find the anchors that a view can see, ascending. int64 [M]"""
         by, near_plane = self.layout.visibility, self.layout.near_plane
         return visible_anchors(self.anchors, self.log_scales, view, by=by, near_plane=near_plane)
 
     def seen_from(self, view: View) -> tuple[Tensor, Tensor]:
-        """Camera centre [3] and indices of the visible anchors [M], as `decode` takes them."""
+        """Return camera centre [3] and indices of visible anchors [M], as `decode` takes them."""
         return camera_centre_tensor(view, self.device), self.visible(view)
 
     def decode(self, period_weights: Tensor, centre: Tensor, visible: Tensor) -> Splats:
-        """Gaussians of the visible anchors; arguments as those of `DecodeInputs`, see `decode`."""
+        """Decode the visible anchors; arguments as those of `DecodeInputs`."""
         return decode(self._decode_inputs(period_weights, centre, visible))
 
     def decode_active(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
     ) -> tuple[Splats, Tensor]:
-        """`decode` without the Gaussians that are switched off, and the places of the others."""
+        """Return `decode` without Gaussians that are switched off, and the places of the others."""
         return decode_active(self._decode_inputs(period_weights, centre, visible))
 
     def _decode_inputs(
@@ -259,7 +261,7 @@ class AnchorModel:
         )
 
     def seen_features(self, centre: Tensor) -> Tensor:
-        """What all periods share, as the MLPs get it in a view. [A, F]"""
+        """Return the features that all periods share, as the MLPs get them in a view. [A, F]"""
         features = self.features
         if self.layout.direction == "full":  # a second base feature that nothing trains
             features = torch.cat([features, self.anchors - centre], dim=1)
@@ -267,12 +269,12 @@ class AnchorModel:
 
     @staticmethod
     def input_dim(layout: AnchorLayout, head: str) -> int:
-        """Inputs of the first layer of an MLP: base, period, direction, global side by side."""
+        """Count the inputs of an MLP: base, period, direction, global feature side by side."""
         global_dim = layout.global_dim if head in layout.global_heads else 0
         return layout.base_dim + layout.period_dim + 3 + global_dim
 
     def first_layer(self, head: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Columns of ``w1`` that act on the base, period, direction and global input. [H, ·]"""
+        """Split ``w1`` into columns for base, period, direction and global input. [H, ·]"""
         layout, w1 = self.layout, self.heads[head].w1
         dims = [layout.base_dim, layout.period_dim, 3]
         base, period, directions, table = w1.split([*dims, w1.shape[1] - sum(dims)], dim=1)
@@ -281,9 +283,9 @@ class AnchorModel:
         return base, period, directions, table
 
     def longer_global(self, length: int, generator: np.random.Generator) -> dict[str, Tensor]:
-        """What changes where global features get more numbers, which are zero, so that images stay.
+        """Return the tensors that change if global features get more numbers, zeros at first.
 
-        Their weights are drawn as `draw_mlp` does.
+        Images stay as they are. The weights are drawn as `draw_mlp` does.
         """
         added = length - self.layout.global_dim
         if added <= 0:
@@ -298,7 +300,7 @@ class AnchorModel:
         return changed
 
     def _kernel_head(self, name: str) -> HeadWeights:
-        """Weights with the inputs of the kernel; one that the MLP does not see has zero columns."""
+        """Return weights for all inputs of the kernel: zeros where the MLP does not see one."""
         layout, head = self.layout, self.heads[name]
         base, period, direction, table = self.first_layer(name)
         widths = (part.shape[1] for part in (base, period, direction, table))
@@ -312,12 +314,12 @@ class AnchorModel:
 
 
 def zero_columns(like: Tensor, count: int) -> Tensor:
-    """Zeros beside a matrix. [rows, count]"""
+    """Make zeros beside a matrix. [rows, count]"""
     return like.new_zeros(len(like), count)
 
 
 def draw_mlp(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> HeadWeights:
-    """Weights and biases uniform within 1/sqrt(inputs), as usual for linear layers."""
+    """Draw weights and biases within 1/sqrt(inputs), as usual for linear layers."""
     first, second = 1.0 / math.sqrt(max(inputs, 1)), 1.0 / math.sqrt(hidden)
     return HeadWeights(
         w1=draw_start((hidden, inputs), "uniform", first, generator),
@@ -328,7 +330,7 @@ def draw_mlp(inputs: int, hidden: int, outputs: int, generator: torch.Generator)
 
 
 def draw_start(shape: Sequence[int], rule: str, scale: float, generator: torch.Generator) -> Tensor:
-    """Start of a tensor: ``zero``, ``uniform`` within +-scale, or ``gaussian``."""
+    """Draw the start of a tensor: ``zero``, ``uniform`` within +-scale, or ``gaussian``."""
     if rule == "zero":
         return torch.zeros(*shape)
     if rule == "uniform":

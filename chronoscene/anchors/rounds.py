@@ -35,20 +35,20 @@ class DrawnView(NamedTuple):
 
     view: TrainingView
     row: int
-    """Which of the features that vary it has."""
+    """Row of its varying features."""
     mask: Tensor | None
-    """Where the photo counts; None for everywhere. bool [H, W]"""
+    """Pixels of the photo that count; None if all do. bool [H, W]"""
     visible: Tensor
     """Anchors that were decoded. int64 [M]"""
     positions: Tensor
-    """Which of their M * k Gaussians are switched on. int64 [L]"""
+    """Places of the Gaussians, of M * k, that are switched on. int64 [L]"""
     opacities: Tensor
     """[L]"""
     info: RasterInfo
 
 
 class DensityControl:
-    """Collects statistics and changes the anchors of a model where a round is due.
+    """Statistics of the views, and the rounds that change the anchors of a model.
 
     Args:
         config: Options of the method.
@@ -56,7 +56,7 @@ class DensityControl:
         train: Views that say which anchors carry something.
         voxel_size: Smallest growth cell in training units.
         seed: Random growth follows from it.
-        feature_rows: Which of the features that vary each view has. [V]
+        feature_rows: Row of the varying features of each view. [V]
         merge_share: Share by which the loss may rise where periods come to share blocks; 0: none.
     """
 
@@ -205,7 +205,7 @@ class DensityControl:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return everything that later rounds depend on: tensors, and what JSON can hold."""
-        tensors = {}
+        tensors: dict[str, Tensor] = {}
         for prefix in ("statistics", "block_statistics"):
             if (counters := getattr(self, prefix)) is not None:
                 tensors |= {f"{prefix}.{name}": t for name, t in counters.state().items()}

@@ -31,7 +31,7 @@ from chronoscene.training.views import ViewSampler
 
 @dataclass(eq=False)
 class AnchorTrainer:
-    """Trains a model on the views of a training set."""
+    """Training of a model on the views of a training set."""
 
     config: AnchorConfig
     model: AnchorModel
@@ -41,11 +41,11 @@ class AnchorTrainer:
     voxel_size: float
     """Smallest growth cell in training units."""
     seed: int
-    """All random choices follow from it."""
+    """Seed of all random choices."""
     rates: Mapping[str, tuple[float, float]]
     """Learning rates by tensor name."""
     feature_rows: NDArray[np.int64]
-    """Which of the features that vary each view has, mostly its period. [V]"""
+    """Row of the varying features of each view, mostly its period. [V]"""
     merge_share: float = 0.0
     """See `DensityControl`."""
 

@@ -1,4 +1,4 @@
-"""Which anchors a view can see: decided before anything is decoded.
+"""Visibility: the anchors that a view can see, decided before anything is decoded.
 
 Source: Scaffold-GS filters anchors by the radius of their projection as Gaussians with the
 anchor's scale and no rotation; the projection is that of the rasterizer (EWA, Zwicker 2001).
@@ -26,7 +26,7 @@ _SLACK = CLAMP_MARGIN / 2
 def visible_anchors(
     anchors: Tensor, log_scales: Tensor, view: View, *, by: str = "radius", near_plane: float
 ) -> Tensor:
-    """Indices of the anchors to decode, ascending. int64 [M]
+    """Return the indices of the anchors to decode, ascending. int64 [M]
 
     Args:
         anchors: Positions in the training frame. [A, 3]
@@ -50,25 +50,25 @@ def visible_anchors(
 
 
 def projected_centres(anchors: Tensor, view: View) -> Tensor:
-    """Pixel positions of anchors in front of a camera. [M, 3] -> float64 [M, 2]"""
+    """Project anchors in front of a camera to pixels. [M, 3] -> float64 [M, 2]"""
     rays, _ = _from_camera(anchors, view)
     pixels = _turned(rays, devices.to_device(view.K.astype(np.float64), rays.device))
     return pixels[:, :2] / pixels[:, 2:]
 
 
 def _from_camera(anchors: Tensor, view: View) -> tuple[Tensor, Tensor]:
-    """Anchors in the frame of a camera, float64 [M, 3], and its rotation."""
+    """Return anchors in the frame of a camera, float64 [M, 3], and its rotation."""
     pose = devices.to_device(view.cam_from_world.astype(np.float64), anchors.device)
     return _turned(anchors.double(), pose[:3, :3]) + pose[:3, 3], pose[:3, :3]
 
 
 def _turned(vectors: Tensor, matrix: Tensor) -> Tensor:
-    """A matrix times each vector; the bits do not depend on the number of threads. [M, 3]"""
+    """Multiply each vector by a matrix, with equal bits for any number of threads. [M, 3]"""
     return (vectors[:, None] * matrix).sum(-1)
 
 
 def _marked(anchors: Tensor, log_scales: Tensor, view: View, near: float, extent: float) -> Tensor:
-    """`_mark` in plain torch: whether an anchor is visible. bool [A]"""
+    """Do what `_mark` does in plain torch: True for visible anchors. bool [A]"""
     rays, rotation = _from_camera(anchors, view)
     z, spreads = rays[:, 2], torch.exp(2.0 * log_scales[:, :3].double())
     visible = (z >= near) & (z <= FAR_PLANE)

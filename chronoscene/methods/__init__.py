@@ -1,4 +1,4 @@
-"""What a method is: data that describes it, and the interface that the harness drives.
+"""Methods: the data that describes one, and the interface that the harness drives.
 
 A method is a plug-in. Its `MethodSpec` is pure data, found through the entry-point group
 ``chronoscene.methods``; listing methods imports nothing heavy. Its class fulfils `Method`. The

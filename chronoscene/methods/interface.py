@@ -32,13 +32,13 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class StepReport:
-    """What one training step tells the harness."""
+    """Report of one training step."""
 
     loss: float
     primitives: int
     """Gaussians or anchors held now."""
     skipped: Skipped | None = None
-    """Why nothing was learned, so that no parameter and no moment of the optimiser changed:
+    """Reason why nothing was learned, so that no parameter and no moment of the optimiser changed:
     ``empty``, the view shows no primitive, or its mask ignores all of the image; ``not finite``,
     the loss or a gradient was not."""
     not_finite: tuple[str, ...] = ()
@@ -47,17 +47,17 @@ class StepReport:
 
 @dataclass(frozen=True, slots=True)
 class MethodSize:
-    """How big a trained model is."""
+    """Size of a trained model."""
 
     primitives: int
     parameters: int
     """Numbers stored in the checkpoint."""
     unit: str = "primitives"
-    """What the primitives are: ``Gaussians``, ``anchors``."""
+    """Name of the primitives: ``Gaussians``, ``anchors``."""
 
 
 class Method(Protocol):
-    """The interface of a method. ``method(config)`` makes one, `setup` or `load` fills it."""
+    """Interface of a method. ``method(config)`` makes one, `setup` or `load` fills it."""
 
     def __init__(self, config: Any) -> None: ...
 
@@ -94,13 +94,13 @@ class Method(Protocol):
         """
 
     def to_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
-        """The model as of a period as Gaussians with spherical harmonics, for other programs.
+        """Return the model as of a period as Gaussians with spherical harmonics.
 
         Only where a method draws Gaussians; one that does not has no such function.
 
         Args:
             period: As for `render`.
-            views: Those of the training. What spherical harmonics cannot hold, such as an opacity
+            views: Training views. What spherical harmonics cannot hold, such as an opacity
                 that depends on the direction, is to be right in these.
 
         Returns:

@@ -27,10 +27,14 @@ from chronoscene.errors import ConfigError
 from chronoscene.methods.spec import MethodSpec, import_object
 
 
-class MethodConfig(Protocol):
-    """Options of a method: a frozen dataclass with a default for each field."""
+class Options(Protocol):
+    """A frozen dataclass with a default for each field."""
 
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+
+class MethodConfig(Options, Protocol):
+    """Options of a method."""
 
     @property
     def iterations(self) -> int:
@@ -74,7 +78,7 @@ def config_from_values(spec: MethodSpec, values: Mapping[str, Any]) -> Any:
         ) from error
 
 
-def check_options(config: MethodConfig) -> None:
+def check_options(config: Options) -> None:
     """Check all options of a config against its annotations; call it in ``__post_init__``.
 
     Raises:
@@ -88,7 +92,7 @@ def check_options(config: MethodConfig) -> None:
 
 
 @cache
-def _adapters(config_class: type[MethodConfig]) -> dict[str, TypeAdapter[Any]]:
+def _adapters(config_class: type[Options]) -> dict[str, TypeAdapter[Any]]:
     """Return what checks and reads each option, by its name."""
     kinds = get_type_hints(config_class, include_extras=True)
     return {

@@ -18,7 +18,7 @@ PROGRAM_GROUP = "chronoscene.programs"
 
 @dataclass(frozen=True, slots=True)
 class Runner:
-    """How another program is trained, and asked for the test views.
+    """Commands that train another program, and ask it for the test views.
 
     A command is a tuple of words. In them, and in the option ``prefix``, these stand for values:
     ``{data}``, the folder of the exported training set; ``{output}``, an empty folder, the current
@@ -43,7 +43,7 @@ class Runner:
     primitives: str | None = None
     """PLY file below ``{output}`` with a vertex for each Gaussian, or whatever is drawn."""
     unit: str = "primitives"
-    """What these are: ``Gaussians``, ``anchors``."""
+    """Name of the primitives: ``Gaussians``, ``anchors``."""
     prepare: str | None = None
     """``module:function``, called with ``{data}``, ``{output}`` and the config before the training:
     it writes there what the export lacks for this program, and returns notices for the user, which
@@ -51,7 +51,7 @@ class Runner:
     version: tuple[str, ...] = ()
     """Command whose last line of output is the version of the program."""
     tested: str = "untested"
-    """How far this recipe was tried, in words."""
+    """Note on how far this recipe was tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class ProgramConfig:
 
 @dataclass(frozen=True, slots=True)
 class MethodSpec:
-    """What the harness knows of a method without importing it."""
+    """Description of a method, known without importing it."""
 
     name: str
     """Name on the command line."""
@@ -96,7 +96,7 @@ class MethodSpec:
     """Options that people change first, in the order of ``chronoscene methods NAME``, which shows
     these alone unless asked for all. Empty: all options."""
     runner: Runner | None = None
-    """How it is run, if it is another program."""
+    """Commands, if it is another program."""
 
 
 def import_object(reference: str) -> Any:
@@ -114,12 +114,12 @@ def import_object(reference: str) -> Any:
 
 
 def method_names(group: str = ENTRY_POINT_GROUP) -> tuple[str, ...]:
-    """Names of the installed methods of an entry-point group, sorted; imports none of them."""
+    """Return the sorted names of the methods of an entry-point group; import none of them."""
     return tuple(sorted({entry.name for entry in entry_points(group=group)}))
 
 
 def installed_methods() -> dict[str, EntryPoint]:
-    """Entry points of all methods by their names, other programs among them."""
+    """Return the entry points of all methods, other programs among them, by name."""
     groups = (PROGRAM_GROUP, ENTRY_POINT_GROUP)
     return {entry.name: entry for group in groups for entry in entry_points(group=group)}
 

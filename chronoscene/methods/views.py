@@ -41,7 +41,7 @@ def nothing_ahead(indices: Sequence[int]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingSet:
-    """Everything that a method may learn from, in the normalised training frame.
+    """Data that a method may learn from, in the normalised training frame.
 
     The training frame is the world, recentred and scaled in float64 before anything is cast to
     float32: learning rates and voxel sizes depend on its scale. The inverse of
@@ -56,7 +56,7 @@ class TrainingSet:
     colors: NDArray[np.uint8]
     """[P, 3]"""
     point_periods: NDArray[np.bool_]
-    """Whether a training view of the period sees the point. [P, T]"""
+    """True where a training view of the period sees the point. [P, T]"""
     training_from_world: Sim3
     camera_extent: float
     """1.1 times the largest distance of a training camera from their mean, in training units."""
@@ -65,8 +65,9 @@ class TrainingSet:
     load_image: Callable[[int], NDArray[np.uint8]]
     """Image of ``views[i]``, decoded lazily and cached. [H, W, 3]"""
     load_mask: Callable[[int], NDArray[np.bool_] | None] = no_mask
-    """Where the image of ``views[i]`` counts; None where all of it does. What the others show must
-    not change the model. [H, W]"""
+    """Pixels of ``views[i]`` that count; None if all do. The others must not change the model.
+    [H, W]"""
     expect: Callable[[Sequence[int]], None] = nothing_ahead
-    """Takes the views whose images will be loaded next, in their order: they are decoded while the
-    method does something else. A method that never calls it waits for each image."""
+    """Function to call with the views whose images will be loaded next, in their order: they are
+    decoded while the method does something else. A method that never calls it waits for each
+    image."""

@@ -33,15 +33,15 @@ DAMAGED = "the file is damaged or was edited: copy it again or train again"
 
 
 class TrainingState(NamedTuple):
-    """Everything that the steps to come depend on."""
+    """State of a training: all that the steps to come depend on."""
 
     tensors: dict[str, Tensor]
     values: dict[str, Any]
-    """What JSON can hold."""
+    """Other values, as JSON can hold them."""
 
 
 def parts(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors ``<prefix>.<name>``, by name."""
+    """Return the tensors ``<prefix>.<name>``, by name."""
     start = f"{prefix}."
     return {k.removeprefix(start): t for k, t in tensors.items() if k.startswith(start)}
 
@@ -78,7 +78,7 @@ def save_tensors(
 def load_tensors(
     folder: Path, *, device: str = "cpu", method: str | None = None, stem: str = "model"
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors by name and the content of ``model.json``, as `save_tensors` wrote them.
+    """Read tensors by name and the content of ``model.json``, as `save_tensors` wrote them.
 
     Args:
         folder: Folder of the model.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Self
 
 from pydantic import NonNegativeFloat
 
+from chronoscene.checks import check_choice
 from chronoscene.methods import check_options
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.exposure import ExposureKind
@@ -16,7 +17,7 @@ from chronoscene.training.exposure import ExposureKind
 class SplattingConfig:
     """Options of all methods that splat Gaussians; a subclass has a field ``iterations``."""
 
-    length_unit: Literal["world", "training"] = "world"
+    length_unit: str = "world"
     """Unit of the options that are lengths. ``world``: that of the scene, as in released code;
     ``training``: that of the training frame, in which the farthest camera is at distance 1, so
     that the unit of the scene does not matter."""
@@ -42,6 +43,7 @@ class SplattingConfig:
 
     def __post_init__(self) -> None:
         check_options(self)
+        check_choice("length_unit", self.length_unit, ("world", "training"))
 
     def in_training_frame(self, training_from_world: float) -> Self:
         """Return the same options with all lengths in units of the training frame.

@@ -1,5 +1,4 @@
-"""Where a step runs: compiled kernels on a CPU, plain torch on a GPU, which the host need not wait
-for.
+"""Devices: compiled kernels on a CPU, plain torch on a GPU, for which the host need not wait.
 
 A copy from the host's ordinary memory, and every question to a tensor that Python wants to know
 the answer of, makes the host wait until a GPU has done all that it was asked for before.
@@ -14,12 +13,12 @@ from torch import Tensor
 
 
 def has_kernels(*tensors: Tensor) -> bool:
-    """Whether compiled kernels can work on tensors, float32 on a CPU; plain torch works on all."""
+    """Return True if compiled kernels can work on tensors: float32 on a CPU."""
     return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
 
 
 def to_device(array: NDArray[np.generic], device: str | torch.device) -> Tensor:
-    """An array as a tensor; a CPU shares its memory, a GPU gets a copy for which nobody waits."""
+    """Make a tensor of an array; a CPU shares its memory, a GPU gets a copy without waiting."""
     tensor = torch.from_numpy(array)
     if torch.device(device).type == "cpu":
         return tensor
@@ -27,14 +26,14 @@ def to_device(array: NDArray[np.generic], device: str | torch.device) -> Tensor:
 
 
 def uniform(generator: np.random.Generator, shape: tuple[int, ...], like: Tensor) -> Tensor:
-    """Random numbers 0..1, drawn where they are needed. float32"""
+    """Draw random numbers 0..1 on the device of a tensor. float32"""
     if like.is_cuda:
         return torch.rand(shape, generator=_on_gpu(generator, like), device=like.device)
     return torch.from_numpy(generator.random(shape, np.float32))
 
 
 def normal(generator: np.random.Generator, shape: tuple[int, ...], like: Tensor) -> Tensor:
-    """Normal random numbers, drawn where they are needed. float64"""
+    """Draw normal random numbers on the device of a tensor. float64"""
     if like.is_cuda:
         drawn = _on_gpu(generator, like)
         return torch.randn(shape, generator=drawn, device=like.device, dtype=torch.float64)
@@ -42,12 +41,12 @@ def normal(generator: np.random.Generator, shape: tuple[int, ...], like: Tensor)
 
 
 def _on_gpu(generator: np.random.Generator, like: Tensor) -> torch.Generator:
-    """A generator on the device of a tensor whose seed comes from the other one."""
+    """Make a generator on the device of a tensor, seeded by the given one."""
     return torch.Generator(like.device).manual_seed(int(generator.integers(2**63)))
 
 
 def exp(x: Tensor) -> Tensor:
-    """``torch.exp`` without a gradient, whose bits do not depend on the number of threads."""
+    """Compute ``torch.exp`` without a gradient, with equal bits for any number of threads."""
     # Torch may take another code path at the end of each thread's share of the rows; NumPy makes
     # one pass.
     if x.is_cuda:

@@ -62,16 +62,15 @@ def draw(
 def weights_in(
     splats: Splats, view: View, pixels: Tensor, *, near_plane: float, antialiased: bool = False
 ) -> Tensor:
-    """What Gaussians add to a view: sums over the pixels of their weight times ``pixels``. [N, 3]
+    """Sum, over the pixels of a view, the weight of each Gaussian times ``pixels``. [N, 3]
 
-    The weight is transmittance times falloff times opacity, what a colour is multiplied by.
+    The weight is transmittance times falloff times opacity: the factor of the colour.
 
     Args:
         splats: The Gaussians; their colours do not matter. [N]
         view: The camera.
         pixels: Three numbers for each pixel, such as 1 in a region and 0 elsewhere. [H, W, 3]
-        near_plane: As for `draw`.
-        antialiased: The same.
+        near_plane: As for `draw`, like ``antialiased``.
     """
     with torch.enable_grad():
         colors = torch.zeros_like(splats.means).requires_grad_()
@@ -89,13 +88,13 @@ def weights_in(
 def step_background(
     background: Tensor, config: SplattingConfig, *, seed: int, number: int
 ) -> Tensor:
-    """What is behind everything in one step of a training. [3] -> [3]
+    """Return the colour behind everything in one step of a training. [3] -> [3]
 
     Args:
         background: The usual colour.
-        config: Says whether it is that, or a random one.
-        seed: Of the run; with the number of the step, all that the colour depends on.
-        number: Of the step.
+        config: Asks for the usual colour or a random one.
+        seed: Seed of the run.
+        number: Number of the step; with the seed, all that a random colour depends on.
     """
     if not config.random_background:
         return background
@@ -104,7 +103,7 @@ def step_background(
 
 
 def prediction_of(raster: Rasterization, exposure: Tensor | None = None) -> Prediction:
-    """What a method hands to the harness, from a call with one view and with depth.
+    """Make the prediction of a view that was drawn alone and with depth.
 
     Args:
         raster: The view.
@@ -119,7 +118,7 @@ def prediction_of(raster: Rasterization, exposure: Tensor | None = None) -> Pred
 
 
 def camera_tensors(view: View, device: str | torch.device = "cpu") -> tuple[Tensor, Tensor]:
-    """World-to-camera transform and intrinsics of one view, as a batch of one.
+    """Return the world-to-camera transform and the intrinsics of a view, as a batch of one.
 
     Returns:
         viewmats: Pose in the training frame. float32 [1, 4, 4]
@@ -131,6 +130,6 @@ def camera_tensors(view: View, device: str | torch.device = "cpu") -> tuple[Tens
 
 
 def camera_centre_tensor(view: View, device: str | torch.device = "cpu") -> Tensor:
-    """Camera centre in the training frame, computed in float64. float32 [3]"""
+    """Compute the camera centre in the training frame, in float64. float32 [3]"""
     centre = camera_centre(np.asarray(view.cam_from_world, dtype=np.float64))
     return to_device(centre.astype(np.float32), device)

@@ -32,16 +32,16 @@ ExposureKind = Literal["none", "image", "period"]
 """``none``: no transforms; else what has one of its own."""
 
 LEARNING_RATE = (0.01, 0.001)
-"""Of Adam, at the start and at the end; log-linear between."""
+"""Learning rate of Adam at the start and at the end; log-linear between."""
 
 
 class Exposure:
-    """The transforms of a training.
+    """Transforms of colours that a training learns.
 
     Args:
-        kind: What has a transform of its own.
-        train: What is trained on.
-        device: Of the tensors.
+        kind: Owner of each transform.
+        train: Training views.
+        device: Device of the tensors.
     """
 
     def __init__(self, kind: str, train: TrainingSet, device: str | torch.device) -> None:
@@ -63,7 +63,7 @@ class Exposure:
         """The transforms, a row for each; no table with kind ``none``. [R, 3, 4]"""
 
     def apply(self, image: Tensor, number: int) -> Tensor:
-        """The image as view ``number`` would show it; gradients reach its transform. [H, W, 3]"""
+        """Return the image as view ``number`` would show it. [H, W, 3]"""
         for table in self.tables:
             image = transformed(image, table.fetch(self._rows[number : number + 1])[0])
         return image
@@ -79,7 +79,7 @@ class Exposure:
             table.step(log_linear(progress, *LEARNING_RATE))
 
     def by_period(self) -> Tensor | None:
-        """The transform of each period, as at first where it has no training image. [T, 3, 4]"""
+        """Return the transform of each period, as at first where it has no image. [T, 3, 4]"""
         if not self.tables:
             return None
         result = self._start.clone()
@@ -89,7 +89,7 @@ class Exposure:
         return result
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that later steps depend on, by name."""
+        """Return everything that later steps depend on, by name."""
         return {name: t for table in self.tables for name, t in table.state().items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -99,7 +99,7 @@ class Exposure:
 
 
 def of_period(transforms: Tensor, period: float) -> Tensor:
-    """The transform of a period, mixed as features are between two; of any if there is but one.
+    """Return the transform of a period, mixed between two as features are.
 
     Args:
         transforms: [T, 3, 4]
@@ -111,7 +111,7 @@ def of_period(transforms: Tensor, period: float) -> Tensor:
 
 
 def transformed(image: Tensor, transform: Tensor) -> Tensor:
-    """A c + b for each pixel c, with [A b] the transform. [H, W, 3], [3, 4] -> [H, W, 3]
+    """Compute A c + b for each pixel c, with [A b] the transform. [H, W, 3], [3, 4] -> [H, W, 3]
 
     Gradients have equal bits for any number of threads.
     """
@@ -119,7 +119,7 @@ def transformed(image: Tensor, transform: Tensor) -> Tensor:
 
 
 def exposed(sh_coeffs: NDArray[np.float32], transform: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Spherical harmonics of Gaussians whose image need not be `transformed` any more.
+    """Transform spherical harmonics, so that the image need not be `transformed` any more.
 
     Equal where the Gaussians are opaque together: what is behind them stays as it is.
 
@@ -147,7 +147,7 @@ class _Transform(torch.autograd.Function):
 
 
 def _mixed(image: Tensor, transform: Tensor) -> Tensor:
-    """The definition of `transformed`."""
+    """Compute `transformed`: its definition in torch, or compiled."""
     if not devices.has_kernels(image):
         return image @ transform[:, :3].T + transform[:, 3]
     result = torch.empty_like(image, memory_format=torch.contiguous_format)
@@ -160,7 +160,7 @@ def _array(tensor: Tensor) -> NDArray[Any]:
 
 
 def _moments(grad: Tensor, image: Tensor) -> Tensor:
-    """Sum over the pixels of the gradient times (c, 1). [H, W, 3], [H, W, 3] -> [3, 4]"""
+    """Sum the gradient times (c, 1) over the pixels. [H, W, 3], [H, W, 3] -> [3, 4]"""
     if not devices.has_kernels(grad):
         products = torch.einsum("hwi,hwj->ij", grad, image)
         return torch.cat([products, grad.sum((0, 1))[:, None]], dim=1)

@@ -31,7 +31,7 @@ _EXPOSURE = "exposure"  # Name of the stored transforms
 
 
 class Trainer(Protocol):
-    """What trains a model by single steps."""
+    """Interface of what trains a model by single steps."""
 
     exposure: Exposure
 
@@ -58,9 +58,9 @@ class SplattingMethod(ABC):
     """
 
     name: ClassVar[str]
-    """On the command line."""
+    """Name on the command line."""
     version: ClassVar[str] = "1"
-    """Of the implementation; stored with every model."""
+    """Version of the implementation; stored with every model."""
     primitive: ClassVar[str]
     """Name of a stored tensor with one row per primitive."""
 

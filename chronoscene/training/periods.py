@@ -20,7 +20,7 @@ from chronoscene.errors import ConfigError
 
 
 def period_weights(period: float, num_periods: int) -> NDArray[np.float32]:
-    """e(t): one-hot for an integer t; linear between the two neighbours otherwise. [T]
+    """Compute e(t): one-hot for an integer t, linear between two neighbours otherwise. [T]
 
     Args:
         period: 0..T-1.
@@ -46,5 +46,5 @@ def period_weights(period: float, num_periods: int) -> NDArray[np.float32]:
 
 
 def with_new_periods(rows: Tensor, count: int) -> Tensor:
-    """A row for each period: new ones start as copies of the last. [S, ...] -> [count, ...]"""
+    """Extend rows to all periods: new ones are copies of the last. [S, ...] -> [count, ...]"""
     return rows.detach()[[min(period, len(rows) - 1) for period in range(count)]]

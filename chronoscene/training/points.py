@@ -10,7 +10,7 @@ from chronoscene.errors import SceneError
 
 
 def finite_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which points have finite coordinates. [P, 3] -> [P]
+    """Return True for points with finite coordinates. [P, 3] -> [P]
 
     Raises:
         SceneError: If there is none.
@@ -27,7 +27,7 @@ def finite_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def rms_spacing(points: NDArray[np.floating], neighbours: int = 3) -> NDArray[np.float64]:
-    """Root mean square distance of each point to its nearest others. [P, 3] -> [P]
+    """Compute the RMS distance of each point to its nearest others. [P, 3] -> [P]
 
     With fewer others than ``neighbours``, to those that there are; 0 for a lone point.
     """

@@ -44,12 +44,12 @@ BLOCK = 512  # Rows that one task handles. Fixed, so that the result does not de
 
 
 def dc_from_rgb(rgb: Tensor) -> Tensor:
-    """Constant coefficient that gives a colour 0..1. [..., 3]"""
+    """Return the constant coefficient that gives a colour 0..1. [..., 3]"""
     return (rgb - 0.5) / C0
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Basis values of unit directions. [..., 3] -> [..., (degree + 1)^2]"""
+    """Compute basis values of unit directions. [..., 3] -> [..., (degree + 1)^2]"""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     values = [torch.full_like(x, C0)]
@@ -68,7 +68,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 def evaluate_reference(
     sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_centre: Tensor, degree: int
 ) -> Tensor:
-    """The definition of `evaluate`, in plain torch, for any floating type and device."""
+    """Compute `evaluate` in plain torch, for any floating type and device: its definition."""
     offsets = means - camera_centre
     # The square root of 0 has no gradient; a Gaussian on the camera centre is never seen.
     lengths = (offsets * offsets).sum(-1, keepdim=True).clamp_min(1e-24).sqrt()
@@ -80,7 +80,7 @@ def evaluate_reference(
 def evaluate(
     sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_centre: Tensor, degree: int
 ) -> Tensor:
-    """Colours of Gaussians as seen from a camera.
+    """Compute the colours of Gaussians as seen from a camera.
 
     Differentiable in everything but the camera centre. On the CPU equal bits for any number of
     threads.
@@ -141,7 +141,7 @@ def _array(tensor: Tensor) -> NDArray[np.float32]:
 
 @inner(inline="always")
 def _write_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
-    """The values without the constant one: ``out[k - 1]`` is basis k. [15]"""
+    """Write the values without the constant one: ``out[k - 1]`` is basis k. [15]"""
     out[0], out[1], out[2] = -_C1 * y, _C1 * z, -_C1 * x
     if degree < 2:
         return
@@ -180,7 +180,7 @@ def _direction_gradient(x, y, z, degree, s):  # type: ignore[no-untyped-def]
 
 @inner(inline="always")
 def _direction(means, n, centre):  # type: ignore[no-untyped-def]
-    """Unit vector from the camera to a Gaussian, and 1 over their distance."""
+    """Return the unit vector from the camera to a Gaussian, and 1 over their distance."""
     x, y, z = means[n, 0] - centre[0], means[n, 1] - centre[1], means[n, 2] - centre[2]
     inverse = np.float32(1.0) / np.sqrt(max(x * x + y * y + z * z, np.float32(1e-24)))
     return x * inverse, y * inverse, z * inverse, inverse

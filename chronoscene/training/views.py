@@ -1,4 +1,4 @@
-"""Views of training steps: which one comes next, and how large its photo is."""
+"""Views of training steps: their order, and smaller versions of their photos."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from chronoscene.methods import TrainingView, nothing_ahead
 
 AHEAD = 32
-"""Draws that are known before they are made; those who prepare them choose how many they want."""
+"""Number of draws that are known before they are made."""
 
 
 class ViewSampler:
-    """Draws view indices without replacement from a shuffled pool that is refilled when empty.
+    """Sampler of view indices without replacement, from a pool that is refilled when empty.
 
     The order is a function of the seed and of the number of draws alone: pool number ``e`` is the
     permutation of a generator seeded with ``(seed, e)``. A resumed run sets `drawn` and continues
@@ -24,7 +24,7 @@ class ViewSampler:
     Args:
         count: Number of views to draw from.
         seed: Seed of the run.
-        expect: Called in each draw with its view and those of the next draws: `TrainingSet.expect`.
+        expect: `TrainingSet.expect`, called in each draw with its view and the next ones.
     """
 
     def __init__(
@@ -35,12 +35,12 @@ class ViewSampler:
         self.count = count
         self.seed = seed
         self.drawn = 0
-        """Draws done so far; may be set to continue an interrupted run."""
+        """Number of draws done; may be set to continue an interrupted run."""
         self._expect = expect
         self._pools: dict[int, NDArray[np.int64]] = {}
 
     def next(self) -> int:
-        """Index of the next view, 0..count-1."""
+        """Draw the index of the next view, 0..count-1."""
         draws = range(self.drawn, self.drawn + min(1 + AHEAD, self.count))
         views = [self._view(draw) for draw in draws]
         self._expect(views)
@@ -48,7 +48,7 @@ class ViewSampler:
         return views[0]
 
     def _view(self, draw: int) -> int:
-        """Index of the view of a draw, counted from 0."""
+        """Return the index of the view of a draw, counted from 0."""
         pool, position = divmod(draw, self.count)
         if pool not in self._pools:
             generator = np.random.default_rng((self.seed, pool))
@@ -58,7 +58,7 @@ class ViewSampler:
 
 
 def downscale_view(view: TrainingView, factor: int) -> TrainingView:
-    """The view at 1/factor of its size; rows and columns that fill no whole pixel are cut off.
+    """Return the view at 1/factor of its size; what fills no whole pixel is cut off.
 
     Pixel (0, 0) is centred at (0.5, 0.5), so image positions are divided by the factor.
     """
@@ -69,7 +69,7 @@ def downscale_view(view: TrainingView, factor: int) -> TrainingView:
 
 
 def downscale_image(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Rounded mean over squares of pixels; the result has the size of `downscale_view`.
+    """Average squares of pixels, rounded; the result has the size of `downscale_view`.
 
     ``factor`` is the edge of a square in pixels; squares are smaller where the image is.
     """

@@ -42,16 +42,16 @@ class HeadWeights(NamedTuple):
 
 
 class DecodeInputs(NamedTuple):
-    """What is decoded. Sizes: A anchors of which M are visible, k offsets, T periods."""
+    """Input of the decoder. Sizes: A anchors of which M are visible, k offsets, T periods."""
 
     anchors: Tensor
     """Positions in the training frame; get no gradient. [A, 3]"""
     offsets: Tensor
     """In units of the anchor's scale. [A, k, 3]"""
     features: Tensor
-    """What all periods share. [A, Fb]"""
+    """Features that all periods share. [A, Fb]"""
     blocks: Tensor
-    """What they do not; an anchor has one block or more. [R, Fv]"""
+    """Features that they do not share; an anchor has one block or more. [R, Fv]"""
     log_scales: Tensor
     """Logarithms, in units of the training frame; 0:3 for offsets, 3:6 for Gaussians. [A, 6]"""
     global_features: Tensor
@@ -71,8 +71,8 @@ class DecodeInputs(NamedTuple):
     used_offsets: Tensor
     """Bit j says whether an anchor uses its offset j; what it does not has opacity -1. int64 [A]"""
     block_rows: Tensor
-    """Which block an anchor has at a period; no two anchors share one. int64 [A, T], or [A, 0]
-    where blocks have no numbers."""
+    """Block of an anchor at a period; no two anchors share one. int64 [A, T], or [A, 0] where
+    blocks have no numbers."""
 
     @property
     def heads(self) -> tuple[HeadWeights, HeadWeights, HeadWeights]:
@@ -80,12 +80,12 @@ class DecodeInputs(NamedTuple):
 
 
 def pack_bits(used: Tensor) -> Tensor:
-    """Bit j for column j. bool [A, k] -> int64 [A]"""
+    """Pack column j into bit j. bool [A, k] -> int64 [A]"""
     return (used.long() << torch.arange(used.shape[1], device=used.device)).sum(1)
 
 
 def unpack_bits(bits: Tensor, count: int) -> Tensor:
-    """Inverse of `pack_bits`. [A] -> bool [A, k]"""
+    """Unpack what `pack_bits` packed. [A] -> bool [A, k]"""
     places = torch.arange(count, device=bits.device)
     return (bits[:, None].long() >> places & 1).bool()
 
@@ -226,7 +226,7 @@ def _check_block_rows(block_rows: Tensor, rows: int) -> None:
 
 
 def mlp(inputs: Tensor, head: HeadWeights) -> Tensor:
-    """Outputs before the activation. [M, I] -> [M, O]"""
+    """Compute outputs before the activation. [M, I] -> [M, O]"""
     return torch.relu(inputs @ head.w1.T + head.b1) @ head.w2.T + head.b2
 
 

@@ -42,7 +42,7 @@ ONE = float32(1)
 
 @inner
 def _has_gradient(grads, g):  # type: ignore[no-untyped-def]
-    """Whether a Gaussian has one: it may be out of the image, or behind others."""
+    """Return True if a Gaussian has a gradient: it may be out of the image, or hidden."""
     found = read(grads.opacities, g) != ZERO
     for c in range(3 * g, 3 * g + 3):
         found |= read(grads.colors, c) != ZERO
@@ -55,7 +55,7 @@ def _has_gradient(grads, g):  # type: ignore[no-untyped-def]
 
 @inner
 def _raw_gradients(outputs, grads, g, count, work, done):  # type: ignore[no-untyped-def]
-    """Gradients of the raw outputs of the Gaussians of an anchor, behind those ``done`` before:
+    """Write gradients of the raw outputs of an anchor's Gaussians, behind those ``done`` before:
 
     tanh' = 1 - tanh^2, sigmoid' = sigmoid (1 - sigmoid), d q/|q| = (I - q q^T / |q|^2) / |q|.
     """
@@ -83,7 +83,7 @@ def _raw_gradients(outputs, grads, g, count, work, done):  # type: ignore[no-unt
 
 @inner
 def _offset_gradients(layout, source, outputs, grads, m, g, count, work, done, out):  # type: ignore[no-untyped-def]
-    """Gradients of the offsets and log scales: means are anchor + offset exp(log_scales[0:3])."""
+    """Write gradients of offsets and log scales: means are anchor + offset exp(log_scales[0:3])."""
     anchor = read_index(source.visible, m)
     for c in range(3):
         offset_sum = scale_sum = ZERO
@@ -100,7 +100,7 @@ def _offset_gradients(layout, source, outputs, grads, m, g, count, work, done, o
 
 @inner
 def _anchor_gradient(layout, source, outputs, grads, m, slot, work, done, out):  # type: ignore[no-untyped-def]
-    """Everything up to the raw outputs; notes the slot with every offset that has a gradient."""
+    """Go back to the raw outputs; note the slot with every offset that has a gradient."""
     g, stop = read_index(outputs.starts, m), read_index(outputs.starts, m + 1)
     factors(source, read_index(source.visible, m), work.row)
     store_cycle(work.row, CYCLE, work.row, 3)
@@ -118,7 +118,7 @@ def _anchor_gradient(layout, source, outputs, grads, m, slot, work, done, out): 
 
 @inner
 def _output_layer_gradient(layout, weights, work, partial):  # type: ignore[no-untyped-def]
-    """From the raw outputs to the hidden units and the second layers."""
+    """Go back from the raw outputs to the hidden units and the second layers."""
     for i in range(0, BLOCK * layout.hiddens, LANES):
         store(work.d_hidden, i, splat(ZERO))
     grads = (work.opacities, work.scales, work.quats, work.colors)
@@ -136,7 +136,7 @@ def _output_layer_gradient(layout, weights, work, partial):  # type: ignore[no-u
 
 @inner
 def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: ignore[no-untyped-def]
-    """From hidden units to features and to the first layers."""
+    """Go back from hidden units to features and to the first layers."""
     hiddens, inputs, columns = layout.hiddens, layout.inputs_pad, layout.features_pad
     zero = splat(ZERO)
     for i in range(0, count * hiddens, LANES):
@@ -176,7 +176,7 @@ def _write_features(layout, source, anchor, d_x, at, out):  # type: ignore[no-un
 
 @inner
 def _block_gradient(layout, weights, source, outputs, grads, count, work, partial, out):  # type: ignore[no-untyped-def]
-    """Gradients from the visible anchors in the first rows of the work space."""
+    """Add gradients of the visible anchors in the first rows of the work space."""
     hidden_layer(layout, weights, work, 0, layout.hiddens)
     done = 0
     for i in range(count):
@@ -204,7 +204,7 @@ def _clear_rows(layout, source, begin, end, out):  # type: ignore[no-untyped-def
 
 @inner
 def _chunk_gradient(layout, weights, source, outputs, grads, begin, end, work, partial, out):  # type: ignore[no-untyped-def]
-    """Visible anchors begin..end, those with a gradient gathered into blocks."""
+    """Add gradients of visible anchors begin..end, gathered into blocks."""
     _clear_rows(layout, source, begin, end, out)
     count = 0
     for m in range(begin, end):
@@ -224,7 +224,7 @@ def _chunk_gradient(layout, weights, source, outputs, grads, begin, end, work, p
 def decode_backward(  # type: ignore[no-untyped-def]
     layout, weights, source, outputs, grads, out, partial, size, work, work_size, tasks
 ):
-    """Gradients of what `decode_forward` reads; arguments as there, and these.
+    """Write gradients of what `decode_forward` reads; arguments as there, and these.
 
     Args:
         grads: `OutputGradients`.

@@ -40,7 +40,7 @@ _MIN_SQUARE = float32(MIN_QUAT_NORM**2)
 
 @inner
 def task_work(work, task, size):  # type: ignore[no-untyped-def]
-    """Work space of a task; ``size`` numbers after that of the task before."""
+    """Return the work space of a task, ``size`` numbers after that of the task before."""
     move = 4 * task * size
     return Work(
         work.rows + move,
@@ -72,7 +72,7 @@ def _prefetch_inputs(layout, source, m):  # type: ignore[no-untyped-def]
 
 @inner
 def block_start(layout, source, anchor, s):  # type: ignore[no-untyped-def]
-    """First number of an anchor's block of the s-th period that is mixed in."""
+    """Return the first number of an anchor's block of the s-th period that is mixed in."""
     at = anchor * source.all_periods + read_index(source.periods, s)
     return read_index(source.block_rows, at) * layout.period
 
@@ -107,7 +107,7 @@ def gather_inputs(layout, source, m, x, slot):  # type: ignore[no-untyped-def]
 
 @inner
 def hidden_layer(layout, weights, work, first, columns):  # type: ignore[no-untyped-def]
-    """First layer of some heads for a block."""
+    """Compute the first layer of some heads for a block."""
     right = (weights.w1_t, first, layout.hiddens)
     bias = (weights.b1, first, 0)
     out = (work.hidden, first, layout.hiddens)
@@ -117,7 +117,7 @@ def hidden_layer(layout, weights, work, first, columns):  # type: ignore[no-unty
 
 @inner
 def _output_layer(layout, weights, work, head, first, columns):  # type: ignore[no-untyped-def]
-    """Second layer of a head for a block: ``columns`` of the outputs from ``first`` on."""
+    """Compute the second layer of a head for a block: ``columns`` outputs from ``first`` on."""
     left = (work.hidden, head * layout.hidden_pad, layout.hiddens, 1)
     right = (weights.w2_t, first, layout.outputs_pad)
     out = (work.raw, first, layout.outputs_pad)
@@ -126,7 +126,7 @@ def _output_layer(layout, weights, work, head, first, columns):  # type: ignore[
 
 @inner
 def _count_row(raw, at, count, m, used, above, out):  # type: ignore[no-untyped-def]
-    """Opacities tanh(o) of an anchor, and how many of its Gaussians are active.
+    """Write the opacities tanh(o) of an anchor, and the number of its active Gaussians.
 
     ``used`` are the bits of its offsets.
     """
@@ -144,7 +144,7 @@ def _count_row(raw, at, count, m, used, above, out):  # type: ignore[no-untyped-
 
 @kernel(parallel=True)
 def decode_opacities(layout, weights, source, above, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
-    """First pass: opacities of all offsets, and the starts of the anchors.
+    """Do the first pass: opacities of all offsets, and the starts of the anchors.
 
     Args:
         source: `Anchors`.
@@ -246,7 +246,7 @@ def _decode_block(layout, weights, source, count, above, work, out):  # type: ig
 
 @kernel(parallel=True)
 def decode_forward(layout, weights, source, above, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
-    """Second pass: everything of the active Gaussians; arguments as `decode_opacities`."""
+    """Do the second pass: all of the active Gaussians; arguments as `decode_opacities`."""
     for task in prange(tasks):
         own = task_work(work, task, work_size)
         for begin in range(task * CHUNK, source.num_visible, tasks * CHUNK):

@@ -146,7 +146,7 @@ def _heads(tensors: Sequence[Tensor]) -> tuple[Head, Head, Head]:
 
 @inner
 def _output_column(layout, head, output):  # type: ignore[no-untyped-def]
-    """Column among the joined outputs of an output of head 0, 1, 2."""
+    """Return the column among the joined outputs of an output of head 0, 1, 2."""
     if head == 0:
         return output
     if head == 2:

@@ -1,4 +1,4 @@
-"""How the decode kernels lay out weights, and the sizes that follow from it.
+"""Layout of weights in the decode kernels, and the sizes that follow from it.
 
 The three heads become one: their first layers side by side (they share the input), their second
 layers in one matrix whose blocks act on the hidden units of one head each. The global feature is
@@ -33,11 +33,11 @@ class Layout(NamedTuple):
     base: int
     period: int
     shared: int
-    """G, of the global feature."""
+    """G, length of the global feature."""
     features: int
-    """Base and period feature."""
+    """Length of base and period feature."""
     inputs: int
-    """Those and the direction."""
+    """Length of those and the direction."""
     hidden: int
     """Per head."""
     offsets: int
@@ -98,7 +98,7 @@ class Weights(NamedTuple):
     b2: int
     """[outputs_pad]"""
     zeros: int
-    """As many as the longest row."""
+    """Zeros, as many as the longest row has numbers."""
 
 
 class Gradients(NamedTuple):
@@ -111,14 +111,14 @@ class Gradients(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Addresses of what one task works in."""
+    """Addresses of the work space of one task."""
 
     rows: int
-    """Which of the visible anchors are in the block. int64 [BLOCK]"""
+    """Visible anchors in the block. int64 [BLOCK]"""
     counts: int
     """Anchors of the block in which an offset has a gradient; zeros between blocks. int64 [k]"""
     slots: int
-    """And which, as pairs of row in the block and Gaussian. int64 [k, BLOCK, 2]"""
+    """Pairs of row in the block and Gaussian, of these. int64 [k, BLOCK, 2]"""
     x: int
     """Inputs. [BLOCK, inputs_pad], and some more"""
     hidden: int
@@ -130,7 +130,7 @@ class Work(NamedTuple):
     d_x: int
     """[BLOCK, features_pad]"""
     row: int
-    """Of one anchor: exp(log_scales) of the Gaussians over and over. [2 CYCLE]"""
+    """Row of one anchor: exp(log_scales) of the Gaussians over and over. [2 CYCLE]"""
     opacities: int
     """Gradients of raw opacities, Gaussians of the block one after the other. [BLOCK k + LANES]"""
     scales: int
@@ -140,7 +140,7 @@ class Work(NamedTuple):
     colors: int
     """[3 (BLOCK k + LANES)]"""
     factors: int
-    """What to multiply the scales by, or their gradients times the scales.
+    """Factors of the scales, or their gradients times the scales.
     [3 (BLOCK k + LANES)]"""
 
 
@@ -156,7 +156,7 @@ class Head(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """Addresses of what is decoded; see `chronoscene.anchors.decode.DecodeInputs`."""
+    """Addresses of the inputs; see `chronoscene.anchors.decode.DecodeInputs`."""
 
     anchors: int
     offsets: int
@@ -172,7 +172,7 @@ class Anchors(NamedTuple):
     block_rows: int
     """int64"""
     periods: int
-    """Those of weight other than 0. int64"""
+    """Periods of weight other than 0. int64"""
     weights: int
     """Their weights."""
     num_periods: int
@@ -181,7 +181,7 @@ class Anchors(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Addresses of what comes out, L active Gaussians."""
+    """Addresses of the outputs, L active Gaussians."""
 
     alphas: int
     """Opacities of all offsets. [M k]"""
@@ -209,7 +209,7 @@ class OutputGradients(NamedTuple):
 
 
 class AnchorGradients(NamedTuple):
-    """Addresses of those with respect to what belongs to anchors."""
+    """Addresses of the gradients with respect to the tensors of the anchors."""
 
     offsets: int
     features: int

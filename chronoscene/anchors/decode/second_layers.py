@@ -22,7 +22,7 @@ PARTS = ((0, 1), (1, 3), (1, 4), (2, 3))
 
 
 def _numbers(builder: Any, address: Any) -> Callable[[Any], Any]:
-    """Pointer to each of the float32 numbers at an address, while code is generated."""
+    """Return a pointer to each of the float32 numbers at an address, while code is generated."""
     base = builder.inttoptr(address, FLOAT.as_pointer())
     return lambda index: builder.gep(base, [index])
 

@@ -98,7 +98,7 @@ class Adam:
             update(value, value.grad, moments, rate, root)
 
     def extend(self, name: str, new_rows: Tensor) -> Tensor:
-        """Append rows [n, ...] with zero moments; returns the new leaf, which has no gradient."""
+        """Append rows [n, ...] with zero moments; return the new leaf, which has no gradient."""
         value = self.params[name]
         check_shape(f"new rows of {name}", new_rows, (None, *value.shape[1:]))
         moments = self._moments[name]
@@ -108,7 +108,7 @@ class Adam:
         return self._replace(name, torch.cat((value.detach(), new_rows.detach().to(value.dtype))))
 
     def keep(self, name: str, mask: Tensor) -> Tensor:
-        """Keep the rows of a mask, bool [rows]; returns the new leaf, which has no gradient."""
+        """Keep the rows of a mask, bool [rows]; return the new leaf, which has no gradient."""
         value = self.params[name]
         check_shape(f"mask of {name}", mask, (value.shape[0],))
         moments = self._moments[name]
@@ -121,7 +121,7 @@ class Adam:
         self._moments[name].square.zero_()
 
     def state(self) -> dict[str, Tensor]:
-        """Moments and step counts by name, for a checkpoint that training resumes from."""
+        """Return moments and step counts by name, for a checkpoint."""
         state: dict[str, Tensor] = {}
         for name, moments in self._moments.items():
             state[f"{name}.mean"] = moments.mean
@@ -217,7 +217,7 @@ INFINITY_BITS = 0x7F800000
 
 @kernel
 def largest_bits(bits):  # type: ignore[no-untyped-def]
-    """Largest magnitude of float32 numbers given as int32, as an integer."""
+    """Find the largest magnitude of float32 numbers given as int32, as an integer."""
     largest = np.int32(0)
     for i in range(bits.shape[0]):
         largest = max(largest, bits[i] & np.int32(0x7FFFFFFF))
@@ -226,7 +226,7 @@ def largest_bits(bits):  # type: ignore[no-untyped-def]
 
 @kernel(parallel=True)
 def largest_bits_of_blocks(bits):  # type: ignore[no-untyped-def]
-    """The same for a large array, blocks spread over the threads."""
+    """Find `largest_bits` of a large array, blocks spread over the threads."""
     size = bits.shape[0]
     found = np.empty((size + BLOCK - 1) // BLOCK, np.int32)
     for block in prange(len(found)):
@@ -249,7 +249,7 @@ class DenseTable:
 
     @property
     def value(self) -> Tensor:
-        """The table; up to date after `flush`."""
+        """Table; up to date after `flush`."""
         return self._adam.params["table"].detach()
 
     def gradient(self) -> Tensor | None:
@@ -257,7 +257,7 @@ class DenseTable:
         return None if self._fetched is None else self._fetched[1].grad
 
     def fetch(self, rows: Tensor) -> Tensor:
-        """Copies of some rows, up to date, as a leaf that collects a gradient. [M, ...]
+        """Copy some rows, up to date, as a leaf that collects a gradient. [M, ...]
 
         `step` uses that gradient; the copies of an earlier call are forgotten. The table is left as
         it is.
@@ -270,7 +270,7 @@ class DenseTable:
         return leaf
 
     def step(self, rate: float) -> None:
-        """One step with a learning rate; what was not fetched has the gradient zero."""
+        """Do one step with a learning rate; rows that were not fetched have the gradient zero."""
         grad = torch.zeros_like(self.value)
         if self._fetched is not None and (found := self._fetched[1].grad) is not None:
             grad[self._fetched[0]] = found
@@ -280,31 +280,33 @@ class DenseTable:
         self._adam.zero_grad()
 
     def flush(self) -> Tensor:
-        """Bring all rows up to date; returns the table."""
+        """Bring all rows up to date; return the table."""
         return self.value
 
     def snapshot(self) -> Tensor:
-        """What `flush` would return, perhaps a copy. Changes nothing: later steps round as if it
-        had not been called."""
+        """Return what `flush` would, perhaps a copy, and change nothing.
+
+        Later steps round as if it had not been called.
+        """
         return self.value
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that later steps depend on, by name."""
+        """Return everything that later steps depend on, by name."""
         return {"value": self.value, **self._adam.state()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> Tensor:
-        """Restore what `state` gave, with any number of rows; returns the table."""
+        """Restore what `state` gave, with any number of rows; return the table."""
         self._fetched = None
         self._adam = Adam({"table": state["value"].to(self.value, copy=True).requires_grad_()})
         self._adam.load_state(state)
         return self.value
 
     def extend(self, new_rows: Tensor) -> Tensor:
-        """Append rows with zero moments; returns the table. [n, ...]"""
+        """Append rows with zero moments; return the table. [n, ...]"""
         self._fetched = None
         return self._adam.extend("table", new_rows).detach()
 
     def keep(self, mask: Tensor) -> Tensor:
-        """Keep the rows where the mask holds; returns the table. bool [R]"""
+        """Keep the rows of a mask; return the table. bool [R]"""
         self._fetched = None
         return self._adam.keep("table", mask).detach()

@@ -46,12 +46,12 @@ ZERO = float32(0)
 
 
 def make_table(value: Tensor) -> RowAdam | DenseTable:
-    """A `RowAdam` where its kernels run, else a `DenseTable`."""
+    """Make a `RowAdam` where its kernels run, else a `DenseTable`."""
     return RowAdam(value) if devices.has_kernels(value) else DenseTable(value)
 
 
 class RowAdam:
-    """A `DenseTable`, its methods explained there, that does not touch what is not read.
+    """`DenseTable`, where methods are explained, that does not touch rows that are not read.
 
     With s steps done, a number that gets no gradient in the steps s + 1 .. t moves by
 
@@ -177,7 +177,7 @@ class RowAdam:
         self._fetched = None
 
     def _addresses(self, rows: Tensor) -> tuple[_Table, _Rows, _Waits]:
-        """The first arguments of both kernels."""
+        """Return the first arguments of both kernels."""
         tables = (self.value.data_ptr(), self._mean.data_ptr(), self._square.data_ptr())
         ways, settled = self._ways, self._settled
         return (
@@ -187,8 +187,10 @@ class RowAdam:
         )
 
     def _new_ways(self) -> NDArray[np.float32]:
-        """For a wait of 0, 1, .. steps up to now: the sum above, and what is left of the two
-        moments. [G + 1, 3]"""
+        """Compute, for waits of 0, 1, .. steps, the sum above and the shares left of the moments.
+
+        [G + 1, 3]
+        """
         speeds = np.array(self._speeds[-_HORIZON:])
         gaps = np.arange(len(speeds) + 1)
         powers = _RATIO ** gaps[1:]
@@ -219,7 +221,7 @@ class _Rows(NamedTuple):
 
 
 class _Waits(NamedTuple):
-    """How far what was not read for a while has moved, and what is left of its moments."""
+    """Ways of rows that were not read for a while, and the shares left of their moments."""
 
     now: int
     """Present step."""
@@ -233,7 +235,7 @@ class _Waits(NamedTuple):
 
 @inner
 def _clean(mean, square):  # type: ignore[no-untyped-def]
-    """Moments without denormal numbers; see `TINY_MEAN`."""
+    """Return moments without denormal numbers; see `TINY_MEAN`."""
     tiny, zero = splat(TINY_MEAN), splat(ZERO)
     mean = select(mean < tiny, select(zero - tiny < mean, zero, mean), mean)
     return mean, select(square < splat(TINY_SQUARE), zero, square)
@@ -241,7 +243,7 @@ def _clean(mean, square):  # type: ignore[no-untyped-def]
 
 @inner
 def _wait_of(table, row, waits):  # type: ignore[no-untyped-def]
-    """Way, and what is left of the moments, of a row that was not read for a while."""
+    """Return the way, and the shares left of the moments, of a row after its wait."""
     stamp = read_index(table.stamps, row)
     gap = waits.now - stamp
     if gap <= waits.longest:
@@ -252,7 +254,7 @@ def _wait_of(table, row, waits):  # type: ignore[no-untyped-def]
 
 @inner
 def _copy(table, row, way, eps, out, m):  # type: ignore[no-untyped-def]
-    """The numbers of one row after their wait, as copy m."""
+    """Copy the numbers of one row after their wait, as copy m."""
     at, to = row * table.columns, m * table.columns
     for c in range(0, table.columns, LANES):
         left = table.columns - c
@@ -293,7 +295,7 @@ def _step(table, row, keep1, keep2, copies, grads, m, scalars):  # type: ignore[
 
 @kernel(parallel=True)
 def _update(table, rows, waits, copies, grads, scalars):  # type: ignore[no-untyped-def]
-    """One step of Adam for rows that `_fetch` wrote to the address ``copies``.
+    """Do one step of Adam for rows that `_fetch` wrote to the address ``copies``.
 
     Args:
         grads: Address of the gradients of the copies.

@@ -18,7 +18,7 @@ from chronoscene.training.photometric.ssim_kernel import CHANNELS, RADIUS, SIGMA
 def photometric_loss(
     image: Tensor, target: Tensor, *, ssim_weight: float = 0.2, mask: Tensor | None = None
 ) -> Tensor:
-    """L1 and structural dissimilarity, differentiable in the image.
+    """Compute L1 and structural dissimilarity, differentiable in the image.
 
         loss = (1 - w) mean|I - T| + w (1 - SSIM(I, T))
 
@@ -55,7 +55,7 @@ def photometric_loss(
 def photometric_loss_reference(
     image: Tensor, target: Tensor, *, ssim_weight: float = 0.2, mask: Tensor | None = None
 ) -> Tensor:
-    """The definition of `photometric_loss` in plain torch, in the type of ``image``."""
+    """Compute `photometric_loss` in plain torch, in the type of ``image``: its definition."""
     _check_images(image, target)
     if mask is not None:
         image, target, share = _where_it_counts(image, target, mask)
@@ -71,7 +71,7 @@ def _unit_range(target: Tensor) -> Tensor:
 
 
 def _where_it_counts(image: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Both images with the same constants where the mask ignores, and the share that counts."""
+    """Return both images, equal and constant where the mask ignores, and the share that counts."""
     check_shape("mask", mask, tuple(image.shape[:2]))
     counts, fixed = mask[..., None], image.detach()
     share = (mask.sum().clamp_min(1).double() / mask.numel()).to(image.dtype)
@@ -80,7 +80,7 @@ def _where_it_counts(image: Tensor, target: Tensor, mask: Tensor) -> tuple[Tenso
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity per pixel and channel in plain torch, zero padding. [H, W, 3]"""
+    """Compute structural similarity per pixel and channel, zero padding. [H, W, 3]"""
     taps = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float64)
     taps = torch.exp(-taps.square() / (2 * SIGMA**2))
     window = torch.outer(taps, taps).div(taps.sum() ** 2).to(image)[None, None]
