@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 from chronoscene.io.processes import Report
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.result import Route
-from chronoscene.registration.work_folder import Stages, run_step
+from chronoscene.registration.work_folder import Stages, run_task
 
 Calibration = Literal["auto", "per-period", "shared"]
 
@@ -100,13 +100,13 @@ class Context:
     def held_out(self) -> Path:
         return self.work / "held_out.npz"
 
-    def step(self, step: str, arguments: Mapping[str, Any]) -> Any:
-        """Run a step in a process of its own; see `run_step`."""
+    def run_task(self, task: str, arguments: Mapping[str, Any]) -> Any:
+        """Run a task in a process of its own; see `run_task`."""
         log = self.work / "log.txt"
-        return run_step(step, arguments, log=log, report=self.report, inherited=(self.lock,))
+        return run_task(task, arguments, log=log, report=self.report, inherited=(self.lock,))
 
     def places(self, name: str) -> dict[str, Any]:
-        """Paths and threads of a step that estimates a model."""
+        """Paths and threads of a task that estimates a model."""
         return {
             "database": str(self.mapping_database),
             "photos": str(self.photos),

@@ -14,7 +14,7 @@ from chronoscene.registration.context import Context, Options
 from chronoscene.registration.features.correspondences import find_matches
 from chronoscene.registration.output import Inspection, inspect_registration
 from chronoscene.registration.photos.captures import Captures
-from chronoscene.registration.photos.inputs import Inputs, gather
+from chronoscene.registration.photos.inputs import PhotoInputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.extension import add_period
 from chronoscene.registration.result import Registered
@@ -93,7 +93,7 @@ def run(
 
 
 def _tie(
-    registered: Registered, points: TiePoints | None, inputs: Inputs, context: Context
+    registered: Registered, points: TiePoints | None, inputs: PhotoInputs, context: Context
 ) -> tuple[Registered, TieAlignment | None]:
     """Check and align with tie points, if there are any."""
     if points is None:
@@ -107,7 +107,7 @@ def _tie(
     return result.model, result
 
 
-def _stage_scene(registered: Registered, inputs: Inputs, name: str, context: Context) -> Path:
+def _stage_scene(registered: Registered, inputs: PhotoInputs, name: str, context: Context) -> Path:
     """Write the scene into the work folder."""
     staged = context.work / "scene"
     old = inputs.scene
@@ -128,7 +128,7 @@ def _stage_scene(registered: Registered, inputs: Inputs, name: str, context: Con
     return staged
 
 
-def _log(registered: Registered, inputs: Inputs, context: Context) -> dict[str, Any]:
+def _log(registered: Registered, inputs: PhotoInputs, context: Context) -> dict[str, Any]:
     """Collect all decisions, as JSON."""
     return {
         "schema_version": SCHEMA_VERSION,

@@ -5,9 +5,9 @@ remarks. The record is written last, to a temporary name that is renamed. A stag
 another fingerprint is done again, and so is everything after it, because the fingerprint of a stage
 covers the one before.
 
-pycolmap can abort the process, and deadlocks after a fork. Its steps therefore run in a fresh
-interpreter (see `chronoscene.io.processes`): an abort turns into a message, and what the step had
-stored stays.
+pycolmap can abort the process, and deadlocks after a fork. Its tasks therefore run in a fresh
+interpreter (see `chronoscene.io.processes`): an abort turns into a message, and what the
+task had stored stays.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 VERSION = 1  # Version of what stages store; other versions are not read
-PATIENCE = 5.0  # Seconds; a step ends within one second after its command was killed
+PATIENCE = 5.0  # Seconds; a task ends within one second after its command was killed
 
 
 def fingerprint(*parts: Any) -> str:
@@ -119,7 +119,7 @@ def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
         patience: Seconds to wait for another process to leave it.
 
     Yields:
-        A file descriptor. A process that inherits it keeps others out as well: steps do, so that
+        A file descriptor. A process that inherits it keeps others out as well: tasks do, so that
         those of a killed command end before the next command begins.
 
     Raises:
@@ -162,7 +162,7 @@ def _locked(descriptor: int) -> bool:
     return True
 
 
-STEPS = {
+TASKS = {
     "features": "chronoscene.registration.features.extraction:extract",
     "matches": "chronoscene.registration.features.matching:match_photos",
     "joint": "chronoscene.registration.reconstruct.routes:joint",
@@ -170,44 +170,43 @@ STEPS = {
     "frozen": "chronoscene.registration.reconstruct.routes:add_period",
     "refine": "chronoscene.registration.reconstruct.routes:refine",
 }
-"""Name of a step to ``module:function``, which takes a dictionary and a `Report` and returns what
-JSON can hold."""
+"""``module:function`` of each task. It takes a dictionary and a `Report`, and returns JSON data."""
 
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""Steps start their own threads; those of a matrix library would wait spinning beside them."""
+"""Tasks start their own threads; those of a matrix library would wait spinning beside them."""
 
 LEAST_SPACE = 64_000_000
-"""Bytes; if a step dies and there is less, a full disk was the cause. Some of what it wrote is
+"""Bytes; if a task dies and there is less, a full disk was the cause. Some of what it wrote is
 already deleted by then."""
 
-LOG_LINES = 4  # Lines of the step's own output in a message
+LOG_LINES = 4  # Lines of the task's own output in a message
 
 
-def run_step(
-    step: str,
+def run_task(
+    task: str,
     arguments: Mapping[str, Any],
     *,
     log: Path,
     report: Report | None = None,
     inherited: Sequence[int] = (),
 ) -> Any:
-    """Run a step in a process of its own and return its result.
+    """Run a task in a process of its own and return its result.
 
     Args:
-        step: One of `STEPS`.
+        task: One of `TASKS`.
         arguments: What JSON can hold.
-        log: File to which the step's own output is appended.
+        log: File to which the task's own output is appended.
         report: Called with its progress.
         inherited: File descriptors that stay open in the process.
 
     Raises:
         DiskFullError: If the process dies and there is hardly any space left.
         RegistrationError: If it dies otherwise.
-        ChronoSceneError: What the step raised, as a `RegistrationError` with the same words.
+        ChronoSceneError: What the task raised, as a `RegistrationError` with the same words.
     """
     with log.open("ab") as file:
         outcome = run_worker(
-            STEPS[step],
+            TASKS[task],
             arguments,
             report=report,
             log=file,
@@ -218,8 +217,8 @@ def run_step(
         _check_space(log.parent)
         said = _end_of(log)
         raise RegistrationError(
-            f"step {step}",
-            expected="the step to finish",
+            f"task {task}",
+            expected="the task to finish",
             found=f"{outcome.cause} ({said})" if said else outcome.cause,
             todo="run the command again; if it happens again, try --threads 1 or other settings; "
             f"see {log}",

@@ -1,4 +1,4 @@
-"""Stages that are done once, and steps in a process of their own."""
+"""Stages that are done once, and tasks in a process of their own."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from chronoscene.errors import DiskFullError, RegistrationError
-from chronoscene.registration.work_folder import STEPS, Stages, run_step, work_folder
+from chronoscene.registration.work_folder import TASKS, Stages, run_task, work_folder
 
 
 class Counter:
@@ -82,7 +82,7 @@ def test_a_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "work").exists()
 
 
-ODD_STEPS = """
+ODD_TASKS = """
 import os, sys, time
 from chronoscene.errors import RegistrationError
 
@@ -113,55 +113,55 @@ def sleeps(arguments, report):
 
 
 @pytest.fixture(autouse=True)
-def odd_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def odd_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps that only this test has, in a module that the child process finds."""
-    (tmp_path / "odd_steps.py").write_text(ODD_STEPS)
+    (tmp_path / "odd_tasks.py").write_text(ODD_TASKS)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     for name in ("good", "aborts", "refuses", "breaks", "threads", "sleeps"):
-        monkeypatch.setitem(STEPS, name, f"odd_steps:{name}")
+        monkeypatch.setitem(TASKS, name, f"odd_tasks:{name}")
 
 
-def test_a_step_gives_its_result_and_tells_its_progress(tmp_path: Path) -> None:
+def test_a_task_gives_its_result_and_tells_its_progress(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
-    result = run_step("good", {"x": 21}, log=tmp_path / "log", report=lambda *p: told.append(p))
+    result = run_task("good", {"x": 21}, log=tmp_path / "log", report=lambda *p: told.append(p))
     assert result == {"twice": 42}
     assert told == [("counting", 1, 2)]
     assert "noise of a library" in (tmp_path / "log").read_text()
 
 
-def test_the_matrix_library_of_a_step_starts_no_threads(tmp_path: Path) -> None:
-    assert run_step("threads", {}, log=tmp_path / "log") == "1"
+def test_the_matrix_library_of_a_task_starts_no_threads(tmp_path: Path) -> None:
+    assert run_task("threads", {}, log=tmp_path / "log") == "1"
 
 
 @pytest.mark.parametrize(
-    ("step", "found"),
+    ("task", "found"),
     [("aborts", r"signal SIGABRT \(.*bad input"), ("breaks", "exit status 1 .*a mistake of ours")],
 )
-def test_the_death_of_a_step_is_a_message(tmp_path: Path, step: str, found: str) -> None:
+def test_the_death_of_a_task_is_a_message(tmp_path: Path, task: str, found: str) -> None:
     with pytest.raises(RegistrationError, match=found) as caught:
-        run_step(step, {}, log=tmp_path / "log")
+        run_task(task, {}, log=tmp_path / "log")
     assert "--threads 1" in caught.value.todo and str(tmp_path / "log") in caught.value.todo
 
 
-def test_the_death_of_a_step_on_a_full_disk_says_so(
+def test_the_death_of_a_task_on_a_full_disk_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=250_000))
     with pytest.raises(DiskFullError, match=r"expected space .*, found 0\.2 MB left.*--work"):
-        run_step("aborts", {}, log=tmp_path / "log")
+        run_task("aborts", {}, log=tmp_path / "log")
 
 
-def test_a_refusal_of_a_step_is_the_same_refusal(tmp_path: Path) -> None:
+def test_a_refusal_of_a_task_is_the_same_refusal(tmp_path: Path) -> None:
     with pytest.raises(RegistrationError, match=r"^here: expected this, found that; do it$"):
-        run_step("refuses", {}, log=tmp_path / "log")
+        run_task("refuses", {}, log=tmp_path / "log")
 
 
-def test_a_step_dies_with_the_process_that_asked_for_it(tmp_path: Path) -> None:
+def test_a_task_dies_with_the_process_that_asked_for_it(tmp_path: Path) -> None:
     code = (
         "from chronoscene.registration import work_folder\n"
         "from pathlib import Path\n"
-        "work_folder.STEPS['sleeps'] = 'odd_steps:sleeps'\n"
-        f"work_folder.run_step('sleeps', {{'mark': {str(tmp_path / 'mark')!r}}}, log=Path('log'))\n"
+        "work_folder.TASKS['sleeps'] = 'odd_tasks:sleeps'\n"
+        f"work_folder.run_task('sleeps', {{'mark': {str(tmp_path / 'mark')!r}}}, log=Path('log'))\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path)
     mark = tmp_path / "mark"

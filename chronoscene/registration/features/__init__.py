@@ -1,6 +1,6 @@
 """Features, verified matches and held-out tracks of the photos, in COLMAP databases.
 
-`correspondences` runs the steps `extraction` and `matching`, each in a process of its own.
+`correspondences` runs `extraction` and `matching` as tasks in processes of their own.
 """
 
 METHOD = "OpenCV RootSIFT 2"

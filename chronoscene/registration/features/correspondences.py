@@ -1,4 +1,4 @@
-"""Second stage: features, verified matches and held-out tracks, each step done once."""
+"""Second stage: features, verified matches and held-out tracks, each task done once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from chronoscene.registration.context import Context
 from chronoscene.registration.features import METHOD
 from chronoscene.registration.features.camera_groups import camera_groups, scene_groups
-from chronoscene.registration.photos.inputs import Inputs
+from chronoscene.registration.photos.inputs import PhotoInputs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class Matched:
     matches_across: Mapping[str, int]
 
 
-def find_matches(inputs: Inputs, context: Context) -> Matched:
+def find_matches(inputs: PhotoInputs, context: Context) -> Matched:
     """Extract features, match photos, and hold out tracks, unless an earlier run did."""
     features = _features(inputs, context)
     found = _matches(inputs, context)
@@ -37,7 +37,7 @@ def find_matches(inputs: Inputs, context: Context) -> Matched:
     )
 
 
-def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
+def _features(inputs: PhotoInputs, context: Context) -> dict[str, Any]:
     options = context.options
     groups = camera_groups(inputs.images, options.camera_model, options.calibration)
     if inputs.scene is not None:
@@ -57,7 +57,7 @@ def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
     def extract() -> tuple[Any, list[str]]:
         # The database may be replaced: pairs that an earlier one had may be missing in it.
         (context.work / "stage-matches.json").unlink(missing_ok=True)
-        found = context.step("features", settings | places)
+        found = context.run_task("features", settings | places)
         count = len(found["keypoints"])
         remark = (
             f"{sum(found['keypoints'].values())} features in {count} photos, {len(groups)} "
@@ -73,7 +73,7 @@ def _reused(count: int, total: int, what: str) -> list[str]:
     return [f"{count} of {total} {what} reused from the previous run"] if count else []
 
 
-def _matches(inputs: Inputs, context: Context) -> dict[str, Any]:
+def _matches(inputs: PhotoInputs, context: Context) -> dict[str, Any]:
     options = context.options
     centres = inputs.centres()
     taken = {c.name: c.taken.isoformat() for c in inputs.images if c.taken is not None}
@@ -98,7 +98,7 @@ def _matches(inputs: Inputs, context: Context) -> dict[str, Any]:
     }
 
     def match() -> tuple[Any, list[str]]:
-        found = context.step("matches", settings | places)
+        found = context.run_task("matches", settings | places)
         kinds = ", ".join(f"{n} {kind}" for kind, n in found["kinds"].items())
         pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
         remarks = [

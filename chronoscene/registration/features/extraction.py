@@ -1,4 +1,4 @@
-"""First step: images and their features in COLMAP's database. Worker process only.
+"""The task ``features``: images and their features in COLMAP's database. Worker process only.
 
 Images enter the database in the order of the photos, so ids are the same in every run. Features
 that are stored are not computed again, and those of the same photos in an earlier database are

@@ -1,4 +1,4 @@
-"""Second step: pairs of photos, their verified matches, and what of them is held out. Worker only.
+"""The task ``matches``: pairs of photos, verified matches, held-out tracks. Worker process only.
 
 A `Matcher` gives the matches (`nearest.mutual_matches`), and COLMAP verifies them by geometry.
 Matches that are in the database already are verified as they are; verified pairs are kept.

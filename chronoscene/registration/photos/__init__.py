@@ -1,1 +1,1 @@
-"""From folders of photos to `Inputs`: images with names, periods and GPS positions."""
+"""From folders of photos to `PhotoInputs`: images with names, periods and GPS positions."""

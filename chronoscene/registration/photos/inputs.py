@@ -1,4 +1,4 @@
-"""First stage: the photos with their final names, periods and positions, where the steps find them.
+"""First stage: the photos with their final names, periods and positions, where the tasks find them.
 
 COLMAP and our format use the pixels as stored. An orientation tag would make viewers and other
 loaders rotate them, so it is set to 1 in a copy, without touching the pixels. Files that COLMAP
@@ -36,7 +36,7 @@ _PLAIN_MODES = ("RGB", "L")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Inputs:
+class PhotoInputs:
     """Photos for feature extraction, including those of a scene that is extended."""
 
     captures: Captures
@@ -81,7 +81,7 @@ class Inputs:
         return known
 
 
-def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
+def gather(captures: Captures, scene: Scene | None, context: Context) -> PhotoInputs:
     """Prepare the photos.
 
     Raises:
@@ -115,7 +115,7 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
     if scene is not None:
         labels = (*(p.label for p in scene.periods), label)
         dates = (*(p.date for p in scene.periods), date)
-    return Inputs(
+    return PhotoInputs(
         captures=captures,
         scene=scene,
         images=images,

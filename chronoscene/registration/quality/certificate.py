@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from chronoscene.arrays import Array, Mask
-from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
+from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
     Misalignment,
@@ -26,7 +26,7 @@ from chronoscene.registration.quality.overlap import TieSpread, ground_plan, tie
 from chronoscene.registration.quality.rays import (
     MAX_OBSERVATIONS,
     Evidence,
-    Placed,
+    PlacedPoints,
     TrackRays,
     gather,
     project,
@@ -54,7 +54,7 @@ class PeriodFigures:
     error: float | None
     """Median reprojection error of its observations in the model, pixels."""
     observations: int
-    gps: GpsFit | str
+    gps: PeriodGpsFit | str
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +160,7 @@ def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures
     rays = evidence.observed[period]
     error = np.linalg.norm(project(rays, model.points[rays.track])[0], axis=1)
     error = error[np.isfinite(error)]
-    gps: GpsFit | str = "the frame is not georeferenced"
+    gps: PeriodGpsFit | str = "the frame is not georeferenced"
     if model.georeference is not None:
         gps = fit_gps(camera_centre(model.cam_from_world[mine]), model.gps_enu[mine])
     return PeriodFigures(
@@ -210,7 +210,7 @@ def _pair(
 
 def _all_transfers(
     model: Registered, evidence: Evidence, a: int, b: int
-) -> tuple[Transfers, Placed, Placed]:
+) -> tuple[Transfers, PlacedPoints, PlacedPoints]:
     """Transfers of held-out tracks and of a sample of the ties, with distinct track numbers."""
     held_out, ties = evidence.held_out, evidence.ties
     ties = ties.where(np.isin(model.periods[ties.image], (a, b)))
@@ -222,15 +222,17 @@ def _all_transfers(
     shift = held_out.track.max(initial=-1) + 1
     rays = TrackRays.join(held_out, replace(ties, track=ties.track + shift))
 
-    def placed(p: int) -> Placed:
+    def placed(p: int) -> PlacedPoints:
         tied = evidence.ties_placed[p].of(sampled)
-        return Placed.join(evidence.held_out_placed[p], replace(tied, track=tied.track + shift))
+        return PlacedPoints.join(
+            evidence.held_out_placed[p], replace(tied, track=tied.track + shift)
+        )
 
     return transfers(rays, model.periods, a, b, (placed(a), placed(b)))
 
 
 def _held_out(
-    moved: Transfers, good: Mask, placed: tuple[Placed, Placed], epipolar: Array
+    moved: Transfers, good: Mask, placed: tuple[PlacedPoints, PlacedPoints], epipolar: Array
 ) -> HeldOut:
     placed_a, placed_b = placed
     error, expected, distance = (x[good] for x in transfer_errors(moved))

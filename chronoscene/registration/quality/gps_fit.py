@@ -16,7 +16,7 @@ SPREAD_FACTOR = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GpsFit:
+class PeriodGpsFit:
     """Differences between the cameras of a period and their GPS positions, in metres."""
 
     positions: int
@@ -38,7 +38,7 @@ class GpsFit:
     """Standard deviation of that median, per axis. [3]"""
 
 
-def fit_gps(centres: Array, gps: Array) -> GpsFit | str:
+def fit_gps(centres: Array, gps: Array) -> PeriodGpsFit | str:
     """Compare cameras with GPS positions; the reason, where that is not possible.
 
     Args:
@@ -60,7 +60,7 @@ def fit_gps(centres: Array, gps: Array) -> GpsFit | str:
     distance = fitted[1]
     noise = max(float(np.median(distance)) / 1.5382, 0.01)
     scale, scale_error, turn, turn_error = _scale_and_turn(source, target, noise)
-    return GpsFit(
+    return PeriodGpsFit(
         positions=int(has.sum()),
         median=float(np.median(distance)),
         largest=float(distance.max()),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints
 from chronoscene.registration.quality.misalignment import generators, rotation_angle
-from chronoscene.registration.quality.rays import Placed, TrackRays, project
+from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, project
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import SIGMA
 
@@ -48,7 +48,7 @@ class Localisation:
     """World units."""
 
 
-def localise(rays: TrackRays, placed: Placed) -> Localisation | str:
+def localise(rays: TrackRays, placed: PlacedPoints) -> Localisation | str:
     """Localise images by the points of the other period, and compare with their poses.
 
     Args:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints
-from chronoscene.registration.quality.rays import Placed, TrackRays, place, project
+from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, place, project
 from chronoscene.scene.similarity import Sim3, fit_robustly
 
 MIN_TRACKS = 12  # Fewer tracks do not determine seven unknowns and their spread
@@ -68,8 +68,12 @@ class Misalignment:
 
 
 def transfers(
-    rays: TrackRays, period: Ints, a: int, b: int, placed: tuple[Placed, Placed] | None = None
-) -> tuple[Transfers, Placed, Placed]:
+    rays: TrackRays,
+    period: Ints,
+    a: int,
+    b: int,
+    placed: tuple[PlacedPoints, PlacedPoints] | None = None,
+) -> tuple[Transfers, PlacedPoints, PlacedPoints]:
     """Transfer tracks between two periods in both directions; also the points of each period.
 
     Args:
@@ -91,7 +95,7 @@ def transfers(
     return both, placed_a, placed_b
 
 
-def _seen(placed: Placed, rays: TrackRays) -> tuple[TrackRays, Array, Array]:
+def _seen(placed: PlacedPoints, rays: TrackRays) -> tuple[TrackRays, Array, Array]:
     found, slot = placed.find(rays.track)
     return rays.where(found), placed.xyz[slot], placed.covariance[slot]
 
@@ -118,7 +122,7 @@ def transfer_variance(jacobian: Array, covariance: Array) -> Array:
 
 
 def measure(
-    moved: Transfers, placed_a: Placed, placed_b: Placed, centres: Array
+    moved: Transfers, placed_a: PlacedPoints, placed_b: PlacedPoints, centres: Array
 ) -> Misalignment | None:
     """Estimate the similarity between two periods, with its uncertainty.
 
@@ -156,7 +160,7 @@ def measure(
     return _describe(moved, similarity, middle, centres)
 
 
-def _begin(moved: Transfers, placed_a: Placed, placed_b: Placed) -> Sim3:
+def _begin(moved: Transfers, placed_a: PlacedPoints, placed_b: PlacedPoints) -> Sim3:
     """Start from the identity, or from a fit to the points if the periods are far apart."""
     error = transfer_errors(moved)[0]
     if np.median(error) < GROSS_PIXELS:

@@ -63,7 +63,7 @@ class TrackRays:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
+class PlacedPoints:
     """Points placed by rays (K points)."""
 
     track: Ints
@@ -83,16 +83,16 @@ class Placed:
         found = self.track[slot] == track
         return found, slot[found]
 
-    def of(self, tracks: Mask) -> Placed:
+    def of(self, tracks: Mask) -> PlacedPoints:
         """The points of some tracks, by a mask over the numbers of all."""
         return self.select(tracks[self.track])
 
-    def select(self, rows: Mask | Ints) -> Placed:
+    def select(self, rows: Mask | Ints) -> PlacedPoints:
         """Some of the points."""
-        return Placed(*(getattr(self, name)[rows] for name in self.__slots__))
+        return PlacedPoints(*(getattr(self, name)[rows] for name in self.__slots__))
 
     @classmethod
-    def join(cls, *parts: Placed) -> Placed:
+    def join(cls, *parts: PlacedPoints) -> PlacedPoints:
         """Points of several, by track."""
         names = cls.__slots__
         every = cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
@@ -182,7 +182,7 @@ def sampson_distance(
         return np.asarray(np.abs((b * line_b).sum(axis=1)) / np.sqrt(square))
 
 
-def place(rays: TrackRays) -> Placed:
+def place(rays: TrackRays) -> PlacedPoints:
     """Triangulate tracks, except those of one image, without parallax, or with large residuals.
 
     First the point nearest to all rays, then three Gauss-Newton steps on the residuals in pixels.
@@ -192,7 +192,9 @@ def place(rays: TrackRays) -> Placed:
     several = np.repeat(count >= 2, count)
     rays, first, count = rays.where(several), first[count >= 2], count[count >= 2]
     if not len(rays):
-        return Placed(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
+        return PlacedPoints(
+            np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
+        )
     first = np.cumsum(count) - count
     local = np.column_stack([rays.uv, np.ones(len(rays))])
     direction = np.einsum("nji,nj->ni", rays.pose[:, :3, :3], local)
@@ -207,7 +209,7 @@ def place(rays: TrackRays) -> Placed:
     normal, _ = _normal_equations(residual, jacobian, first)
     mean_square = np.add.reduceat((residual**2).sum(axis=1), first) / count
     good = (parallax > MIN_PARALLAX) & (mean_square < MAX_OWN_ERROR**2)
-    return Placed(
+    return PlacedPoints(
         track=rays.track[first][good],
         xyz=xyz[good],
         covariance=np.asarray(np.linalg.inv(normal[good]), np.float64),
@@ -242,15 +244,15 @@ class Evidence:
     observed: tuple[TrackRays, ...]
     """A sample of the observations of each period, whatever their points. A track is the index of
     a point here, in `ties` and in `clouds`."""
-    clouds: tuple[Placed, ...]
+    clouds: tuple[PlacedPoints, ...]
     """A sample of the points of each period, placed by its images."""
     ties: TrackRays
     """A sample of the points that several periods see."""
-    ties_placed: tuple[Placed, ...]
+    ties_placed: tuple[PlacedPoints, ...]
     """The ties that each period places."""
     held_out: TrackRays
     """Tracks that took no part in the estimation."""
-    held_out_placed: tuple[Placed, ...]
+    held_out_placed: tuple[PlacedPoints, ...]
     matches: tuple[tuple[TrackRays, TrackRays], ...]
     """Both ends of each of the `Registered.held_out`."""
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from chronoscene.arrays import Array, Mask
 from chronoscene.registration.quality.misalignment import Interval
-from chronoscene.registration.quality.rays import Placed
+from chronoscene.registration.quality.rays import PlacedPoints
 from chronoscene.scene.similarity import SIGMA
 
 NEIGHBOURS = 16  # Points in a patch of a cloud
@@ -52,7 +52,7 @@ class SurfaceDistance:
 
 
 def surface_distance(
-    first: Placed, second: Placed, centre: Array, registration: float
+    first: PlacedPoints, second: PlacedPoints, centre: Array, registration: float
 ) -> SurfaceDistance | str:
     """Compare the point clouds of two periods; the reason, where that is not possible.
 

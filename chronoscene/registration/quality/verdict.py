@@ -15,7 +15,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.registration.quality.certificate import Certificate, PairFigures, PeriodFigures
-from chronoscene.registration.quality.gps_fit import GpsFit
+from chronoscene.registration.quality.gps_fit import PeriodGpsFit
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import MIN_TRACKS, Misalignment
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
@@ -272,7 +272,7 @@ def _of_period(p: PeriodFigures) -> Iterator[Objection]:
     place = f"period {p.label}"
     yield from _check("registered", p.registered / max(p.photos, 1), place)
     yield from _check("images", p.registered, place)
-    if isinstance(p.gps, GpsFit):
+    if isinstance(p.gps, PeriodGpsFit):
         gps = p.gps
         yield from _check("gps_residual", gps.median, place)
         if gps.scale is not None and gps.scale_error is not None:
@@ -284,7 +284,7 @@ def _of_period(p: PeriodFigures) -> Iterator[Objection]:
 
 def _between_gps(certificate: Certificate) -> Iterator[Objection]:
     """Judge the GPS offset between every two periods; either of the two may be wrong."""
-    fits = [(p, p.gps) for p in certificate.periods if isinstance(p.gps, GpsFit)]
+    fits = [(p, p.gps) for p in certificate.periods if isinstance(p.gps, PeriodGpsFit)]
     for i, (p, one) in enumerate(fits):
         for q, other in fits[i + 1 :]:
             gap = (one.offset - other.offset)[:2]

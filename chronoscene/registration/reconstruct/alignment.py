@@ -117,7 +117,8 @@ def _polish(pairs: PointPairs, best: Sim3, cell: NDArray[np.int64]) -> Alignment
         inliers = now
     residual = residual_pixels(best, pairs)
     median = float(np.median(residual[inliers])) if inliers.any() else np.inf
-    return Alignment(best, inliers, len(np.unique(cell[inliers])), median)
+    count = len(np.unique(cell[inliers]))
+    return Alignment(best, inliers, cells=count, median_pixels=median)
 
 
 def residual_pixels(target_from_source: Sim3, pairs: PointPairs) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from chronoscene.colmap.model import read_model
 from chronoscene.errors import RegistrationError
 from chronoscene.registration.context import Context
 from chronoscene.registration.features.correspondences import Matched
-from chronoscene.registration.photos.inputs import Inputs
+from chronoscene.registration.photos.inputs import PhotoInputs
 from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered, Route
 from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
@@ -38,7 +38,7 @@ SAME_POSITION = 0.01
 FEW_FEATURES = 100
 
 
-def estimate(inputs: Inputs, matched: Matched, context: Context) -> Registered:
+def estimate(inputs: PhotoInputs, matched: Matched, context: Context) -> Registered:
     """The route that fits, or the better of two."""
     route = choose_route(inputs, matched, context)
     registered = _run_route(route, inputs, matched, context)
@@ -53,7 +53,7 @@ def estimate(inputs: Inputs, matched: Matched, context: Context) -> Registered:
     return registered
 
 
-def choose_route(inputs: Inputs, matched: Matched, context: Context) -> Route:
+def choose_route(inputs: PhotoInputs, matched: Matched, context: Context) -> Route:
     """The route asked for, or the one that the matches allow."""
     remark = context.stages.remark
     if inputs.scene is not None:
@@ -81,7 +81,7 @@ def connected_periods(matched: Matched, count: int) -> bool:
 
 
 def _or_separate(
-    joint: Registered, inputs: Inputs, matched: Matched, context: Context
+    joint: Registered, inputs: PhotoInputs, matched: Matched, context: Context
 ) -> Registered:
     """The joint model, or the separate one if it has more of the poorest period."""
     shares = _shares(joint, inputs)
@@ -102,7 +102,7 @@ def _or_separate(
     return other if better else joint
 
 
-def _shares(registered: Registered, inputs: Inputs) -> dict[int, float]:
+def _shares(registered: Registered, inputs: PhotoInputs) -> dict[int, float]:
     """Share of the photos that are registered, by period."""
     return {
         i: float((registered.periods == i).sum()) / total
@@ -111,7 +111,7 @@ def _shares(registered: Registered, inputs: Inputs) -> dict[int, float]:
     }
 
 
-def _run_route(route: Route, inputs: Inputs, matched: Matched, context: Context) -> Registered:
+def _run_route(route: Route, inputs: PhotoInputs, matched: Matched, context: Context) -> Registered:
     settings: dict[str, Any] = {"periods": inputs.periods}
     if route == "frozen":
         settings["poses"] = {f.name: f.cam_from_world[:3].tolist() for f in inputs.frames}
@@ -127,7 +127,7 @@ def _run_route(route: Route, inputs: Inputs, matched: Matched, context: Context)
 
 
 def refined(
-    registered: Registered, arguments: Mapping[str, Any], inputs: Inputs, context: Context
+    registered: Registered, arguments: Mapping[str, Any], inputs: PhotoInputs, context: Context
 ) -> Registered:
     """A registration adjusted again after tie points have moved its periods."""
     result = _estimate("refine", "refined", dict(arguments), context)
@@ -137,11 +137,11 @@ def refined(
     return _with_lost(again, dict(registered.unregistered) | dict.fromkeys(lost, reason), inputs)
 
 
-def _estimate(step: str, name: str, settings: dict[str, Any], context: Context) -> dict[str, Any]:
-    """Run a step that estimates, once; stages after it do not depend on it."""
+def _estimate(task: str, name: str, settings: dict[str, Any], context: Context) -> dict[str, Any]:
+    """Run a task that estimates, once; stages after it do not depend on it."""
 
     def action() -> tuple[Any, list[str]]:
-        found = context.step(step, settings | context.places(name))
+        found = context.run_task(task, settings | context.places(name))
         shutil.rmtree(context.work / f"scratch-{name}", ignore_errors=True)
         numbers = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in found["model"].items())
         return found, [*found["remarks"], numbers]
@@ -153,7 +153,7 @@ def _estimate(step: str, name: str, settings: dict[str, Any], context: Context) 
 
 
 def _assemble(
-    route: Route, name: str, result: Mapping[str, Any], inputs: Inputs, context: Context
+    route: Route, name: str, result: Mapping[str, Any], inputs: PhotoInputs, context: Context
 ) -> Registered:
     """Read a model and what was held out; photos without a pose are left to the caller."""
     model = read_model(context.work / f"model-{name}")
@@ -253,11 +253,14 @@ def cross_matches(tracks: HeldOutTracks, periods: NDArray[np.int64]) -> tuple[Cr
     new = (np.diff(first, prepend=-1) != 0) | (np.diff(second, prepend=-1) != 0)
     return tuple(
         CrossMatches(
-            int(first[rows[0]]), int(second[rows[0]]), tracks.xy[a[rows]], tracks.xy[b[rows]],
-            track[a[rows]],
+            image_a=int(first[rows[0]]),
+            image_b=int(second[rows[0]]),
+            xy_a=tracks.xy[a[rows]],
+            xy_b=tracks.xy[b[rows]],
+            track=track[a[rows]],
         )
         for rows in np.split(np.arange(len(a)), np.flatnonzero(new))[1:]
-    )  # fmt: skip
+    )
 
 
 def reasons(
@@ -284,7 +287,7 @@ def reasons(
     return found
 
 
-def _with_lost(registered: Registered, lost: Mapping[str, str], inputs: Inputs) -> Registered:
+def _with_lost(registered: Registered, lost: Mapping[str, str], inputs: PhotoInputs) -> Registered:
     """The same registration with reasons for the photos that it lacks."""
     refused = {name: reason for name, (_, reason) in inputs.refused.items()}
     periods = {name: period for name, (period, _) in inputs.refused.items()}

@@ -95,7 +95,9 @@ def align_to_gps(
     rms = float(np.sqrt(np.mean(residuals[near] ** 2)))
     spread = float(np.sqrt(((enu[near] - enu[near].mean(axis=0)) ** 2).sum(axis=1).mean()))
     scale_error = rms / max(spread * np.sqrt(len(near)), 1e-12)
-    return GpsAlignment(similarity, inliers, residuals, rms, scale_error, on_a_line)
+    return GpsAlignment(
+        similarity, inliers, residuals, rms=rms, scale_error=scale_error, on_a_line=on_a_line
+    )
 
 
 def _first_guess(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:

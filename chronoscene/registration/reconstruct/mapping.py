@@ -49,8 +49,8 @@ SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """Arguments and remarks that the functions of one step share."""
+class Task:
+    """Arguments and remarks that the functions of one task share."""
 
     database: str
     photos: str
@@ -63,15 +63,15 @@ class Job:
     """For the log; added to."""
 
     @classmethod
-    def start(cls, arguments: Mapping[str, Any], report: Report) -> Job:
-        """Begin a step with its arguments."""
+    def start(cls, arguments: Mapping[str, Any], report: Report) -> Task:
+        """Begin a task with its arguments."""
         quiet()
         database, photos, threads = (arguments[k] for k in ("database", "photos", "threads"))
         out, scratch = Path(arguments["out"]), Path(arguments["scratch"])
         return cls(database, photos, out, scratch, threads, report, [])
 
     def finish(self, model: pycolmap.Reconstruction, **result: Any) -> dict[str, Any]:
-        """Write the model, and return the result of the step, as JSON."""
+        """Write the model, and return the result of the task, as JSON."""
         write_model(model, self.out, self.photos)
         return {
             "remarks": self.remarks,
@@ -83,24 +83,26 @@ class Job:
         } | result
 
 
-def map_images(job: Job, names: Sequence[str], *, label: str = "") -> list[pycolmap.Reconstruction]:
+def map_images(
+    task: Task, names: Sequence[str], *, label: str = ""
+) -> list[pycolmap.Reconstruction]:
     """Map images with several settings; the best result, its largest model first.
 
     Args:
-        job: The step.
+        task: The task.
         names: Images to map.
         label: Prefix of the remarks, and folder below the scratch folder.
     """
     best: list[pycolmap.Reconstruction] = []
     for number, (kind, settings) in enumerate(SETTINGS):
-        options = pipeline_options(job)
+        options = pipeline_options(task)
         options.image_names = list(names)
         for key, value in settings.items():
             setattr(options.mapper, key, value)
-        models = _run(job, job.scratch / label / f"mapping-{number}", options, len(names))
+        models = _run(task, task.scratch / label / f"mapping-{number}", options, len(names))
         sizes = [int(m.num_reg_images()) for m in models]
         remark = f"mapping with {kind} settings: models of {sizes or 'no'} images"
-        job.remarks.append(f"{label.replace('-', ' ')}: {remark}" if label else remark)
+        task.remarks.append(f"{label.replace('-', ' ')}: {remark}" if label else remark)
         if sum(sizes[:1]) > sum(m.num_reg_images() for m in best[:1]):
             best = models
         if best and best[0].num_reg_images() >= SATISFIED * len(names):
@@ -108,14 +110,14 @@ def map_images(job: Job, names: Sequence[str], *, label: str = "") -> list[pycol
     return best
 
 
-def pipeline_options(job: Job) -> pycolmap.IncrementalPipelineOptions:
+def pipeline_options(task: Task) -> pycolmap.IncrementalPipelineOptions:
     """Options of all mapping runs."""
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = MIN_MODEL_SIZE
     options.max_num_models = 20
     options.random_seed = SEED
-    options.num_threads = job.threads
-    options.image_path = job.photos
+    options.num_threads = task.threads
+    options.image_path = task.photos
     options.extract_colors = False  # those of the final model are extracted when it is written
     options.ba_global_frames_ratio = 1.2
     options.ba_global_points_ratio = 1.2
@@ -123,14 +125,14 @@ def pipeline_options(job: Job) -> pycolmap.IncrementalPipelineOptions:
 
 
 def _run(
-    job: Job, out: Path, options: pycolmap.IncrementalPipelineOptions, total: int
+    task: Task, out: Path, options: pycolmap.IncrementalPipelineOptions, total: int
 ) -> list[pycolmap.Reconstruction]:
     """Run the mapper; disjoint models, the largest first."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    count = _counter(job.report, "mapping", total)
+    count = _counter(task.report, "mapping", total)
     models = pycolmap.incremental_mapping(
-        job.database, job.photos, str(out), options, next_image_callback=count
+        task.database, task.photos, str(out), options, next_image_callback=count
     )
     return _disjoint(sorted(models.values(), key=lambda m: -m.num_reg_images()))
 
@@ -162,48 +164,48 @@ def _disjoint(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Recons
 
 
 def register_rest(
-    model: pycolmap.Reconstruction, job: Job, total: int, folder: str
+    model: pycolmap.Reconstruction, task: Task, total: int, folder: str
 ) -> pycolmap.Reconstruction:
     """Register images that have no pose yet, one after the other; the others do not move.
 
     Args:
         model: With points from the matches of its images.
-        job: The step.
+        task: The task.
         total: Number of images in all.
         folder: Below the scratch folder.
     """
-    scratch = job.scratch / folder
+    scratch = task.scratch / folder
     shutil.rmtree(scratch, ignore_errors=True)
     for name in ("from", "to"):
         (scratch / name).mkdir(parents=True)
     model.write_binary(str(scratch / "from"))
-    options = pipeline_options(job)
+    options = pipeline_options(task)
     options.multiple_models = False
     options.fix_existing_frames = True
     options.mapper.abs_pose_min_num_inliers = MIN_INLIERS
     options.constant_cameras = {model.images[i].camera_id for i in model.reg_image_ids()}
     models = pycolmap.incremental_mapping(
-        job.database,
-        job.photos,
+        task.database,
+        task.photos,
         str(scratch / "to"),
         options,
         str(scratch / "from"),
-        next_image_callback=_counter(job.report, "registering", total - model.num_reg_images()),
+        next_image_callback=_counter(task.report, "registering", total - model.num_reg_images()),
     )
     return max(models.values(), key=lambda m: m.num_reg_images()) if models else model
 
 
-def triangulate(model: pycolmap.Reconstruction, job: Job, folder: str) -> pycolmap.Reconstruction:
+def triangulate(model: pycolmap.Reconstruction, task: Task, folder: str) -> pycolmap.Reconstruction:
     """Triangulate points again from all matches; poses and cameras do not change."""
-    scratch = job.scratch / folder
+    scratch = task.scratch / folder
     scratch.mkdir(parents=True, exist_ok=True)
     return pycolmap.triangulate_points(
         model,
-        job.database,
-        job.photos,
+        task.database,
+        task.photos,
         str(scratch),
         clear_points=True,
-        options=pipeline_options(job),
+        options=pipeline_options(task),
     )
 
 

@@ -1,4 +1,4 @@
-"""The routes from matches to one model, as steps of the worker process.
+"""The routes from matches to one model, as tasks of the worker process.
 
 ``joint`` maps the photos of all periods together, ``separate`` each period alone, and
 ``add_period`` registers new photos in a scene whose poses and cameras stay. ``refine`` adjusts a
@@ -24,7 +24,7 @@ from chronoscene.registration.reconstruct.consistency import (
 )
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
 from chronoscene.registration.reconstruct.mapping import (
-    Job,
+    Task,
     adjust,
     map_images,
     register_rest,
@@ -52,31 +52,31 @@ def joint(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     name, or null), ``keep_unplaced`` (see `submodels.combine`), ``out`` (model folder),
     ``scratch``, ``threads``.
     """
-    job = Job.start(arguments, report)
-    models = map_images(job, sorted(arguments["periods"]))
+    task = Task.start(arguments, report)
+    models = map_images(task, sorted(arguments["periods"]))
     submodels = [Submodel(f"submodel {i}", model) for i, model in enumerate(models)]
-    return _merged(submodels, arguments, job)
+    return _merged(submodels, arguments, task)
 
 
 def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Map each period alone, then align, merge and adjust the models. Arguments as in `joint`."""
-    job = Job.start(arguments, report)
+    task = Task.start(arguments, report)
     periods: Mapping[str, int] = arguments["periods"]
     submodels = []
     for period in sorted(set(periods.values())):
         names = sorted(n for n, p in periods.items() if p == period)
-        models = map_images(job, names, label=f"period-{period}")
+        models = map_images(task, names, label=f"period-{period}")
         for i, model in enumerate(models):
-            adjust(model, threads=job.threads)
+            adjust(model, threads=task.threads)
             label = f"period {period}" + (f" submodel {i}" if len(models) > 1 else "")
             submodels.append(Submodel(label, model, period, is_largest=i == 0))
-    return _merged(submodels, arguments, job)
+    return _merged(submodels, arguments, task)
 
 
 def _merged(
-    submodels: Sequence[Submodel], arguments: Mapping[str, Any], job: Job
+    submodels: Sequence[Submodel], arguments: Mapping[str, Any], task: Task
 ) -> dict[str, Any]:
-    """Align, merge, adjust and write submodels, and return the result of the step."""
+    """Align, merge, adjust and write submodels, and return the result of the task."""
     if not submodels:
         also = "; tie points align models, they do not create them"
         raise RegistrationError(
@@ -86,34 +86,34 @@ def _merged(
             todo="add photos that overlap by more than half, taken from different positions"
             f"{also if arguments['keep_unplaced'] else ''}",
         )
-    _, matches = verified_matches(job.database)
+    _, matches = verified_matches(task.database)
     priors, keep_unplaced = Priors.of(arguments["priors"]), arguments["keep_unplaced"]
     if len(submodels) == 1:
         combined = Combined(submodels[0].model, (), (), ())
         model = combined.model
-        adjust(model, threads=job.threads)
+        adjust(model, threads=task.threads)
     else:
-        job.report("aligning", 0, 1)
-        combined = combine(submodels, matches, priors, job.database, keep_unplaced=keep_unplaced)
-        job.remarks.extend(combined.remarks)
+        task.report("aligning", 0, 1)
+        combined = combine(submodels, matches, priors, task.database, keep_unplaced=keep_unplaced)
+        task.remarks.extend(combined.remarks)
         model = combined.model
         for i in range(ROUNDS):
-            job.report("adjusting", i, ROUNDS)
-            model = triangulate(model, job, "points")
-            adjust(model, threads=job.threads)
+            task.report("adjusting", i, ROUNDS)
+            model = triangulate(model, task, "points")
+            adjust(model, threads=task.threads)
     if not keep_unplaced:  # periods that wait for tie points would contradict the others
-        model = _settled(model, matches, len(arguments["periods"]), job)
-    job.report("adjusting", 0, 1)
-    placed, used = to_gps_frame(model, priors, job.remarks)
+        model = _settled(model, matches, len(arguments["periods"]), task)
+    task.report("adjusting", 0, 1)
+    placed, used = to_gps_frame(model, priors, task.remarks)
     if placed:
         before = summary(model)["reprojection_error_px"]
-        ended = adjust(model, priors=used, threads=job.threads)
+        ended = adjust(model, priors=used, threads=task.threads)
         after = summary(model)["reprojection_error_px"]
-        job.remarks.append(
+        task.remarks.append(
             f"bundle adjustment with {len(used.enu)} position priors: {ended.lower()}, "
             f"reprojection error {before} -> {after} px"
         )
-    return job.finish(
+    return task.finish(
         model,
         is_georeferenced=placed,
         positions_used=sorted(used.enu),
@@ -123,28 +123,28 @@ def _merged(
 
 
 def _settled(
-    model: pycolmap.Reconstruction, matches: Matches, total: int, job: Job
+    model: pycolmap.Reconstruction, matches: Matches, total: int, task: Task
 ) -> pycolmap.Reconstruction:
     """Register missing images, deregister those that the others contradict, and try these again."""
     for _ in range(ATTEMPTS):
-        model = _complete(model, total, job)
-        if not deregister_misplaced(model, matches, job.remarks):
+        model = _complete(model, total, task)
+        if not deregister_misplaced(model, matches, task.remarks):
             break
-        adjust(model, threads=job.threads)
+        adjust(model, threads=task.threads)
     return model
 
 
-def _complete(model: pycolmap.Reconstruction, total: int, job: Job) -> pycolmap.Reconstruction:
+def _complete(model: pycolmap.Reconstruction, total: int, task: Task) -> pycolmap.Reconstruction:
     """Register images that their own period could not: other periods may have points for them."""
     before = int(model.num_reg_images())
     if before == total or not model.num_points3D():
         return model
-    fuller = register_rest(model, job, total, "rest")
+    fuller = register_rest(model, task, total, "rest")
     added = int(fuller.num_reg_images()) - before
     if added <= 0:
         return model
-    adjust(fuller, threads=job.threads)
-    job.remarks.append(f"{added} more images registered with the merged model")
+    adjust(fuller, threads=task.threads)
+    task.remarks.append(f"{added} more images registered with the merged model")
     return fuller
 
 
@@ -158,11 +158,11 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     Arguments: ``database``, ``photos``, ``poses`` (``cam_from_world``, 3 x 4, by name, of the
     scene's images), ``periods`` (by name, of all), ``out``, ``scratch``, ``threads``.
     """
-    job = Job.start(arguments, report)
+    task = Task.start(arguments, report)
     poses = arguments["poses"]
-    model = known_images(job.database)
+    model = known_images(task.database)
     old = _set_poses(model, poses)
-    _, matches = verified_matches(job.database)
+    _, matches = verified_matches(task.database)
     agreeing = agreement(pair_agreements(model, matches), old)
     if agreeing < MIN_AGREEMENT:
         raise RegistrationError(
@@ -172,9 +172,9 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             todo="check that its poses belong to its images: chronoscene validate",
         )
     report("triangulating", 0, 1)
-    model = triangulate(model, job, "base")
+    model = triangulate(model, task, "base")
     points = int(model.num_points3D())
-    job.remarks.extend(
+    task.remarks.extend(
         [
             f"{agreeing:.0%} of the matches within the scene agree with its poses",
             f"{len(old)} images of the scene give {points} points; their poses are unchanged",
@@ -187,8 +187,8 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             found=f"{points}",
             todo="check that its poses belong to its images: chronoscene validate",
         )
-    model = register_rest(model, job, len(arguments["periods"]), "continued")
-    deregister_misplaced(model, matches, job.remarks, sorted(old))
+    model = register_rest(model, task, len(arguments["periods"]), "continued")
+    deregister_misplaced(model, matches, task.remarks, sorted(old))
     new = [i for i in model.reg_image_ids() if i not in old]
     if not new:
         raise RegistrationError(
@@ -199,13 +199,13 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             "together",
         )
     report("adjusting", 0, 1)
-    ended = adjust(model, constant=old, threads=job.threads)
+    ended = adjust(model, constant=old, threads=task.threads)
     moved = _max_change(model, poses)
-    job.remarks.append(f"{len(new)} new images registered")
-    job.remarks.append(
+    task.remarks.append(f"{len(new)} new images registered")
+    task.remarks.append(
         f"bundle adjustment of the new images: {ended.lower()}; old poses changed by {moved:.1e}"
     )
-    return job.finish(model)
+    return task.finish(model)
 
 
 def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -215,18 +215,18 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``out``, ``scratch``,
     ``threads``.
     """
-    job = Job.start(arguments, report)
-    model = known_images(job.database)
+    task = Task.start(arguments, report)
+    model = known_images(task.database)
     for image_id in _set_poses(model, arguments["poses"]):
         image = model.images[image_id]
         model.cameras[image.camera_id].params = arguments["cameras"][str(image.name)]
     for i in range(2):
         report("adjusting", i, 2)
-        model = triangulate(model, job, "")
+        model = triangulate(model, task, "")
         _add_ties(model, arguments["ties"])
-        adjust(model, threads=job.threads)
-    job.remarks.append(f"adjusted with {len(arguments['ties'])} tie points")
-    return job.finish(model)
+        adjust(model, threads=task.threads)
+    task.remarks.append(f"adjusted with {len(arguments['ties'])} tie points")
+    return task.finish(model)
 
 
 def _set_poses(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> set[int]:

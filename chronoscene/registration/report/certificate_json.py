@@ -19,7 +19,7 @@ from chronoscene.registration.quality.certificate import (
     PairFigures,
     PeriodFigures,
 )
-from chronoscene.registration.quality.gps_fit import GpsFit
+from chronoscene.registration.quality.gps_fit import PeriodGpsFit
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Interval, Misalignment, rotation_angle
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
@@ -65,7 +65,7 @@ def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[
         over = f"{period.observations:,} observations"
         yield Figure("reprojection error, median", period.error, "px", over)
     gps = period.gps
-    if not isinstance(gps, GpsFit):
+    if not isinstance(gps, PeriodGpsFit):
         yield Figure("GPS residual", None, "m", "", absent=gps)
         return
     over = f"{gps.positions} positions"

@@ -157,10 +157,14 @@ def camera_map(model: Registered) -> CameraMap:
         end = at[i] + vector * (MAX_GPS_VECTOR * MAP_WIDTH / length) if cut else gps[i]
         cameras.append(
             MapCamera(
-                name, int(model.periods[i]), *_pair(at[i]), _pair(tips[i]),
-                _pair(end) if np.isfinite(length) else None, cut,
+                name,
+                int(model.periods[i]),
+                *_pair(at[i]),
+                tip=_pair(tips[i]),
+                gps=_pair(end) if np.isfinite(length) else None,
+                cut=cut,
             )
-        )  # fmt: skip
+        )
     inside = ((points >= low) & (points <= high)).all(axis=1)
     bar, label = _bar(scale, model.unit)
     return CameraMap(

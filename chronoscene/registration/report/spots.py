@@ -9,7 +9,7 @@ import numpy as np
 
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.registration.quality.certificate import PairFigures
-from chronoscene.registration.quality.rays import Evidence, Placed, project, rays_at
+from chronoscene.registration.quality.rays import Evidence, PlacedPoints, project, rays_at
 from chronoscene.registration.result import CrossMatches, Registered
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
@@ -177,7 +177,9 @@ def drawn_pairs(model: Registered, evidence: Evidence) -> list[DrawnPair]:
     return sorted(pairs, key=lambda p: p.median)
 
 
-def _match_errors(model: Registered, matches: CrossMatches, placed: Sequence[Placed]) -> Array:
+def _match_errors(
+    model: Registered, matches: CrossMatches, placed: Sequence[PlacedPoints]
+) -> Array:
     """Distance of each match to where the other period puts its point; NaN where none does."""
     errors = np.full((2, len(matches.track)), np.nan)
     ends = (matches.image_a, matches.image_b, matches.xy_b), (

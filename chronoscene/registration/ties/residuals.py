@@ -9,7 +9,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
-from chronoscene.registration.quality.rays import Placed, TrackRays, place, project, rays_at
+from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, place, project, rays_at
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_points import TiePoints, match_images
 
@@ -76,15 +76,15 @@ def moved(rays: TrackRays, model: Registered) -> TrackRays:
     return replace(rays, pose=model.cam_from_world[rays.image])
 
 
-def place_clicks(rays: TrackRays) -> Placed:
+def place_clicks(rays: TrackRays) -> PlacedPoints:
     """Triangulate clicks; a single bad click is left out if the point fits without it."""
     placed = place(rays)
     missing = np.setdiff1d(rays.track, placed.track)
     rescued = [p for t in missing if (p := _without_one(rays.where(rays.track == t)))]
-    return Placed.join(placed, *rescued)
+    return PlacedPoints.join(placed, *rescued)
 
 
-def _without_one(rays: TrackRays) -> Placed | None:
+def _without_one(rays: TrackRays) -> PlacedPoints | None:
     """Triangulate a point without the click that fits worst; None if nothing fits."""
     if len(rays) < 4:
         return None

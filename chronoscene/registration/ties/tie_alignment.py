@@ -83,7 +83,9 @@ def align_with_tie_points(
     found = tuple(residuals(model, clicks, control if controlled else {}))
     named = [r.name for r in found if r.outlier]
     remarks += more + ([f"outliers: {', '.join(named)}"] if named else [])
-    return TieAlignment(model, replaced, controlled, found, tuple(remarks))
+    return TieAlignment(
+        model, replaced=replaced, controlled=controlled, residuals=found, remarks=tuple(remarks)
+    )
 
 
 def _align_periods(

@@ -28,7 +28,7 @@ from chronoscene.registration.features.extraction import extract
 from chronoscene.registration.features.matching import match
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.photos.inputs import gather
-from chronoscene.registration.work_folder import STEPS, Stages, work_folder
+from chronoscene.registration.work_folder import TASKS, Stages, work_folder
 from chronoscene.synth import SynthSettings, generate
 
 SETTINGS = SynthSettings(
@@ -558,7 +558,7 @@ def test_the_command_goes_on_from_the_run_before(
     # that the database has no more.
     write_table(captures, "2016", "2023", "2023", "2023")
     with monkeypatch.context() as patch:
-        patch.setitem(STEPS, "matches", "no_such_module:killed")
+        patch.setitem(TASKS, "matches", "no_such_module:killed")
         with pytest.raises(RegistrationError, match="no_such_module"):
             matched(captures)
     write_table(captures, "2016", "2023", "2023", "2023", "2016")

@@ -14,11 +14,11 @@ import pytest
 from benchmarks.registration.generated import CaseSettings, generate_case, pose_errors
 from chronoscene.registration.quality import certificate as certificate_module
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
-from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
+from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment, Transfers
 from chronoscene.registration.quality.overlap import tie_spread
-from chronoscene.registration.quality.rays import Placed, gather
+from chronoscene.registration.quality.rays import PlacedPoints, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.quality.verdict import THRESHOLDS, judge
 from chronoscene.registration.report.certificate_json import pair_figures, period_figures, to_json
@@ -58,7 +58,7 @@ def test_every_figure_is_measured(certificate: Certificate) -> None:
     assert isinstance(pair.localised_a, Localisation)
     assert isinstance(pair.localised_b, Localisation)
     assert isinstance(pair.surfaces, SurfaceDistance)
-    assert all(isinstance(p.gps, GpsFit) for p in certificate.periods)
+    assert all(isinstance(p.gps, PeriodGpsFit) for p in certificate.periods)
     assert pair.held_out.median < 1.0
     assert pair.held_out.distance < 0.4
     assert pair.surfaces.median < pair.surfaces.level
@@ -308,9 +308,9 @@ def plane(rng: np.random.Generator, count: int, noise: float) -> np.ndarray:
     return np.concatenate([ground, wall, other]) + rng.normal(0, noise, (3 * count, 3))
 
 
-def as_cloud(xyz: np.ndarray) -> Placed:
+def as_cloud(xyz: np.ndarray) -> PlacedPoints:
     count = len(xyz)
-    return Placed(np.arange(count), xyz, np.tile(np.eye(3), (count, 1, 1)), np.zeros(count))
+    return PlacedPoints(np.arange(count), xyz, np.tile(np.eye(3), (count, 1, 1)), np.zeros(count))
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.1, -0.2, 0.25)])
@@ -348,14 +348,14 @@ def test_gps_finds_offset_scale_and_turn() -> None:
     gps[:4] += 200
     gps[5] = np.nan
     found = fit_gps(centres, gps)
-    assert isinstance(found, GpsFit)
+    assert isinstance(found, PeriodGpsFit)
     assert found.positions == 39
     assert found.outliers == 4
     assert found.scale == pytest.approx(1.1, abs=0.03)
     assert found.turn == pytest.approx(5.0, abs=1.5)
     assert found.largest > 150 > 3 > found.median
     assert fit_gps(centres[6:9], gps[6:9]) == "fewer than 4 images have a GPS position"
-    assert isinstance(fit_gps(centres[6:10], gps[6:10]), GpsFit)
+    assert isinstance(fit_gps(centres[6:10], gps[6:10]), PeriodGpsFit)
     assert isinstance(fit_gps(centres, np.full_like(centres, np.nan)), str)
 
 

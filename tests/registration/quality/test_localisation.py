@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from chronoscene.arrays import Array
 from chronoscene.registration.quality.localisation import Localisation, localise
-from chronoscene.registration.quality.rays import Placed, TrackRays
+from chronoscene.registration.quality.rays import PlacedPoints, TrackRays
 from chronoscene.scene.geometry import pose_from_rotation_translation
 
 IMAGES, FOCAL = 50, 800.0
@@ -22,7 +22,7 @@ POSE = pose_from_rotation_translation(
 
 def observed(
     points: int, noise: Array, point_noise: float = 0.0, images: int = IMAGES
-) -> tuple[TrackRays, Placed]:
+) -> tuple[TrackRays, PlacedPoints]:
     """Images at one pose, each with points of its own.
 
     Args:
@@ -42,7 +42,7 @@ def observed(
         uv=local[:, :2] / local[:, 2:] + noise / FOCAL,
         focal=np.full((count, 2), FOCAL),
     )
-    placed = Placed(
+    placed = PlacedPoints(
         track=np.arange(count),
         xyz=xyz + rng.normal(0, 1, (count, 3)) * point_noise,
         covariance=np.broadcast_to(point_noise**2 * np.eye(3), (count, 3, 3)),
@@ -51,7 +51,7 @@ def observed(
     return rays, placed
 
 
-def found(rays: TrackRays, placed: Placed) -> Localisation:
+def found(rays: TrackRays, placed: PlacedPoints) -> Localisation:
     result = localise(rays, placed)
     assert isinstance(result, Localisation)
     assert result.images == result.tried

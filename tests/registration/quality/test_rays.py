@@ -19,7 +19,7 @@ def test_every_point_is_placed_once_in_each_period(
     model = generate_case(CaseSettings(periods=3, seed=5)).model
     placed, unprojected = [], []
 
-    def counted(of: TrackRays) -> rays.Placed:
+    def counted(of: TrackRays) -> rays.PlacedPoints:
         placed.append(len(of))
         return place(of)
 

@@ -21,7 +21,7 @@ from chronoscene.registration.quality.certificate import (
     PairFigures,
     PeriodFigures,
 )
-from chronoscene.registration.quality.gps_fit import GpsFit
+from chronoscene.registration.quality.gps_fit import PeriodGpsFit
 from chronoscene.registration.quality.localisation import Excess, Localisation
 from chronoscene.registration.quality.misalignment import Interval, Misalignment
 from chronoscene.registration.quality.overlap import TieSpread
@@ -40,7 +40,7 @@ def misalignment(rotation: float = 0.03, shift: float = 0.03) -> Misalignment:
 
 def made(count: int = 2) -> Certificate:
     """A registration that passes with a margin in every figure."""
-    gps = GpsFit(
+    gps = PeriodGpsFit(
         positions=20, median=3.0, largest=9.0, outliers=0,
         scale=1.0, scale_error=0.01, turn=0.0, turn_error=0.5,
         offset=np.zeros(3), offset_error=np.array([0.3, 0.1, 50.0]),
@@ -92,7 +92,7 @@ def with_period(certificate: Certificate, period: int = 1, **changes: Any) -> Ce
 
 def with_gps(certificate: Certificate, period: int = 1, **changes: Any) -> Certificate:
     gps = certificate.periods[period].gps
-    assert isinstance(gps, GpsFit)
+    assert isinstance(gps, PeriodGpsFit)
     return with_period(certificate, period, gps=replace(gps, **changes))
 
 

@@ -15,7 +15,7 @@ from chronoscene.registration.features.correspondences import Matched
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import Captures, read_captures
 from chronoscene.registration.photos.gps_priors import locate
-from chronoscene.registration.photos.inputs import Inputs
+from chronoscene.registration.photos.inputs import PhotoInputs
 from chronoscene.registration.pipeline import run
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.models import known_images
@@ -139,7 +139,7 @@ def test_clicks_place_a_period_that_nothing_matches(
     case = make_case(cross_matches=0.0)
     clicks = tmp_path / "clicks.csv"
     write_projections(case, clicks, 12)
-    inputs = Inputs(
+    inputs = PhotoInputs(
         captures=Captures(case.folder, (), (), (), ()), scene=None, images=(), periods=case.periods,
         labels=LABELS, dates=LABELS, refused={}, positions=locate(()), georeference=None,
     )  # fmt: skip
