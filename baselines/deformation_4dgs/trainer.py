@@ -62,5 +62,7 @@ class DeformationTrainer(GaussianTrainer):
         if not self.model.is_deforming:
             return photometric
         config = self.config
-        weights = Weights(config.space_smoothness, config.time_smoothness, config.time_sparsity)
+        weights = Weights(
+            space=config.space_smoothness, time=config.time_smoothness, ones=config.time_sparsity
+        )
         return photometric + smoothness(self.model.shared, self.model.field, weights)

@@ -120,18 +120,21 @@ def rasterize(
     check_choice("backend", backend, ["auto", *BACKENDS], error=BackendError)
     if backend == "auto":
         backend = "cuda" if means.is_cuda else "cpu"
-    gaussians = (means, quats, scales, opacities, colors)
     inputs = Inputs(
-        *gaussians,
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
         viewmats,
         Ks,
-        width,
-        height,
-        near_plane,
-        far_plane,
-        eps2d,
-        backgrounds,
-        render_depth,
+        width=width,
+        height=height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        eps2d=eps2d,
+        backgrounds=backgrounds,
+        render_depth=render_depth,
         absgrad=absgrad,
         antialiased=antialiased,
     )

@@ -66,13 +66,15 @@ def _flight(world: World, count: int, rng: np.random.Generator) -> list[tuple[Ar
     shares = [round(0.42 * count), round(0.24 * count)]
     high = rng.uniform(0.66, 0.84) * half
     low = rng.uniform(0.46, 0.58) * half
-    planned = _orbit(world, shares[0], rng, rng.uniform(0.85, 1.02) * half, high)
-    planned += _orbit(world, shares[1], rng, rng.uniform(0.5, 0.66) * half, low)
+    radius = rng.uniform(0.85, 1.02) * half
+    planned = _orbit(world, shares[0], rng, radius=radius, height=high)
+    radius = rng.uniform(0.5, 0.66) * half
+    planned += _orbit(world, shares[1], rng, radius=radius, height=low)
     return planned + _grid(world, count - sum(shares), rng, rng.uniform(0.6, 0.75) * half)
 
 
 def _orbit(
-    world: World, count: int, rng: np.random.Generator, radius: float, height: float
+    world: World, count: int, rng: np.random.Generator, *, radius: float, height: float
 ) -> list[tuple[Array, Array]]:
     """A closed orbit; cameras aim beside the centre, so that the whole core is covered."""
     middle = world.core.mean(axis=0) + rng.normal(0, 0.06 * radius, 2)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from baselines.realtime_4dgs.slicing.kernels import slice_backward, slice_forward
@@ -23,8 +26,7 @@ class Slice(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         plain = [group.detach().contiguous() for group in groups]
         outputs = [torch.empty_like(group) for group in plain[: len(OUTPUTS)]]
-        arrays = (tensor.numpy() for tensor in (*plain, *outputs))
-        slice_forward(float(time), float(cycle), order, *arrays)
+        slice_forward(float(time), float(cycle), order, _arrays(plain), _arrays(outputs))
         ctx.save_for_backward(*groups)
         ctx.settings = float(time), float(cycle), order
         return tuple(outputs)
@@ -35,10 +37,13 @@ class Slice(torch.autograd.Function):
         inputs = [t.detach().contiguous() for t in (log_scales, quats, logits, *others)]
         grads = tuple(grad.contiguous() for grad in grads)
         found = [torch.zeros_like(tensor) for tensor in inputs]
-        arrays = (tensor.numpy() for tensor in (*inputs, *grads, *found))
-        slice_backward(*ctx.settings, *arrays)
+        slice_backward(*ctx.settings, _arrays(inputs), _arrays(grads), _arrays(found))
         d_scales, d_quats, d_logits, *d_time, d_waves_dc, d_waves_rest = found
         d_waves = (d_waves_dc, d_waves_rest) if ctx.settings[-1] else (None, None)
         g_means, _, _, _, g_dc, g_rest = grads
         d_space = (g_means, d_scales, d_quats, d_logits, g_dc, g_rest)
         return None, None, None, *d_space, *d_time, *d_waves
+
+
+def _arrays(tensors: Sequence[Tensor]) -> tuple[NDArray[np.float32], ...]:
+    return tuple(tensor.numpy() for tensor in tensors)

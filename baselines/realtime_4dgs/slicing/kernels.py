@@ -165,29 +165,11 @@ def _rest_of_turn(y):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def slice_forward(  # type: ignore[no-untyped-def]
-    time,
-    cycle,
-    order,
-    means,
-    log_scales,
-    quats,
-    logits,
-    sh_dc,
-    sh_rest,
-    right_quats,
-    time_means,
-    log_time_scales,
-    waves_dc,
-    waves_rest,
-    out_means,
-    out_scales,
-    out_quats,
-    out_logits,
-    out_dc,
-    out_rest,
-):
+def slice_forward(time, cycle, order, inputs, outputs):  # type: ignore[no-untyped-def]
     """Groups of `SHAPES` to groups of `OUTPUTS`, all of them float32."""
+    means, log_scales, quats, logits, sh_dc, sh_rest = inputs[:6]
+    right_quats, time_means, log_time_scales, waves_dc, waves_rest = inputs[6:]
+    out_means, out_scales, out_quats, out_logits, out_dc, out_rest = outputs
     count = len(means)
     for block in prange((count + BLOCK - 1) // BLOCK):
         m, y = np.empty((4, 4)), np.empty((3, 4))
@@ -260,35 +242,17 @@ def _store_gradient(grad, unit, length, out, n):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def slice_backward(  # type: ignore[no-untyped-def]
-    time,
-    cycle,
-    order,
-    log_scales,
-    quats,
-    logits,
-    right_quats,
-    time_means,
-    log_time_scales,
-    waves_dc,
-    waves_rest,
-    g_means,
-    g_scales,
-    g_quats,
-    g_logits,
-    g_dc,
-    g_rest,
-    d_scales,
-    d_quats,
-    d_logits,
-    d_right_quats,
-    d_time_means,
-    d_log_time_scales,
-    d_waves_dc,
-    d_waves_rest,
-):
-    """Gradients of the parameters, d, from those of the outputs, g. Gradients of means, sh_dc and
-    sh_rest are those of the outputs. All that is written holds zeros."""
+def slice_backward(time, cycle, order, inputs, grads, found):  # type: ignore[no-untyped-def]
+    """Gradients of the parameters, d, from those of the outputs, g.
+
+    Inputs are without means, sh_dc and sh_rest, whose gradients are those of the outputs.
+    ``found`` holds zeros.
+    """
+    log_scales, quats, logits, right_quats, time_means, log_time_scales = inputs[:6]
+    waves_dc, waves_rest = inputs[6:]
+    g_means, g_scales, g_quats, g_logits, g_dc, g_rest = grads
+    d_scales, d_quats, d_logits, d_right_quats, d_time_means, d_log_time_scales = found[:6]
+    d_waves_dc, d_waves_rest = found[6:]
     count = len(quats)
     for block in prange((count + BLOCK - 1) // BLOCK):
         m, y, d = np.empty((4, 4)), np.empty((3, 4)), np.empty((4, 4))

@@ -33,7 +33,7 @@ def square(block: Block) -> None:
     for i, (fx, fy) in enumerate(((0.17, 0.17), (0.83, 0.17), (0.83, 0.83), (0.17, 0.83))):
         c, w = inner.at(fx, fy), 0.11 * min(inner.size)
         bed = Rect.around(c, w)
-        block.lawn(bed, f"bed_{i}", "mown", SLAB + 0.03)
+        block.lawn(bed, f"bed_{i}", kind="mown", z=SLAB + 0.03)
         for j in range(1 if w < 2.5 else 3):
             at = bed.at(*rng.uniform(0.2, 0.8, 2)) if w >= 2.5 else bed.at(0.5, 0.5)
             block.plant(f"tree_{i}{j}", at)
@@ -67,7 +67,7 @@ def park(block: Block) -> None:
     low, size = np.array([inner.x0, inner.y0]), np.array(inner.size)
     curves = low + np.concatenate([first, second]) * size
     for i, curve in enumerate((curves[:25], curves[25:])):
-        block.gravel_path(f"path_{i}", curve, 2.2)
+        block.gravel_path(f"path_{i}", curve, width=2.2)
     block.scatter_trees(inner, int(np.prod(size) / 70), curves)
     for i in range(4):
         k = int(rng.integers(4, 20)) + 25 * (i % 2)
@@ -145,10 +145,10 @@ def slabs(block: Block) -> None:
     for k in range(int((lot.size[0] - 1) // 2.6)):
         x = lot.x0 + 1.35 + 2.6 * k
         places += [(x, lot.y0 + 2.5, SLAB, np.pi / 2), (x, lot.y1 - 2.5, SLAB, np.pi / 2)]
-    block.park_cars("lot", places if lot.size[1] > 11 else places[::2], 0.4)
+    block.park_cars("lot", places if lot.size[1] > 11 else places[::2], chance=0.4)
     if lot.y1 < lower.y1 - 0.5:
         rest = Rect(lower.x0, lot.y1, lower.x1, lower.y1)
-        block.lawn(rest, "strip", "mown")
+        block.lawn(rest, "strip", kind="mown")
         if rest.size[1] > 3:
             block.scatter_trees(rest.inset(1.2), int(rest.size[0] // 8))
 
@@ -208,7 +208,7 @@ def site(block: Block) -> None:
     _site_gear(block, steps, spec)
     young = [round(3.2 + 0.6 * p, 2) if s == "finished" else None for p, s in enumerate(steps)]
     for i in range(4):
-        block.tree(f"young_{i}", inner.at(0.12 + 0.25 * i, 0.93), young, 2, broad=True)
+        block.tree(f"young_{i}", inner.at(0.12 + 0.25 * i, 0.93), young, detail=2, broad=True)
 
 
 def _site_gear(block: Block, steps: Sequence[str], spec: Building) -> None:
@@ -250,7 +250,7 @@ def renewal(block: Block) -> None:
     for k in range(int((left.size[0] - 1) // 2.6)):
         here = [s == "park" and bool(rng.random() < 0.55) for s in steps]
         at = np.array([left.x0 + 1.35 + 2.6 * k, left.y0 + 2.5, SLAB])
-        block.car(f"visitor_{k}", at, np.pi / 2, here)
+        block.car(f"visitor_{k}", at, heading=np.pi / 2, present=here)
     block.lawn(right)
     new = Rect(right.x0 + 1.0, right.y0 + 0.3 * dy, right.x1 - 0.5, right.y1 - 1.0)
     storeys = int(rng.integers(2, 5))
@@ -280,7 +280,8 @@ def suburb(block: Block) -> None:
             world.always(spec.name, "building", partial(finished, spec, world.seed))
             at = plot.at(0.86, float(rng.uniform(0.2, 0.8)))
             heights = [float(rng.uniform(5, 9))] * world.periods
-            block.tree(f"tree_{i}{j}", at, heights, 2 if world.near else 1, broad=False)
+            detail = 2 if world.near else 1
+            block.tree(f"tree_{i}{j}", at, heights, detail=detail, broad=False)
 
 
 FILLERS: dict[str, Callable[[Block], None]] = {

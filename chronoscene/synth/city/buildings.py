@@ -159,7 +159,7 @@ def rubble(spec: Building, seed: int) -> Mesh:
         side /= np.linalg.norm(side, axis=1, keepdims=True)
         up = np.cross(a, side)
         at = np.column_stack([center + place[mine] * half, SLAB + height[mine]])
-        style = pal.plain_style(b, c, 0.4, 0.4)
+        style = pal.plain_style(b, c, strength=0.4, size=0.4)
         b.boxes(at, a * size[:, :1], side * size[:, 1:2], up * size[:, 2:], style)
     wall = pal.wall_style(b, "brick", rng, spec.storey)
     low = [r.x0, r.y0, SLAB]

@@ -54,7 +54,7 @@ class Front:
         trim = srgb(206, 198, 182) if light else srgb(96, 98, 100)
         return cls(
             wall=pal.wall_style(b, wall, rng, storey),
-            trim=pal.plain_style(b, pal.tint(rng, trim), 0.2, 0.8),
+            trim=pal.plain_style(b, pal.tint(rng, trim), strength=0.2, size=0.8),
             glass=pal.glass_style(b, frame, panes),
             shop_glass=pal.glass_style(b, srgb(50, 52, 54), (3, 1)),
             sign=b.style(SIGN, c_sign, pal.WHITE, srgb(40, 40, 42)),
@@ -95,17 +95,17 @@ class Wall:
         return inside - depth * self.out
 
     def box(
-        self, x: Array | float, z: float, w: float, h: float, depth: float, style: int,
-        gap: float = 0.0,
+        self, x: Array | float, z: float, style: int,
+        *, w: float, h: float, depth: float, gap: float = 0.0,
     ) -> None:  # fmt: skip
         """Boxes that project from the wall by ``depth`` and end a ``gap`` before it."""
         corner = self.at(x, z, -depth)
         self.b.boxes(corner, w * self.along, -(depth - gap) * self.out, h * Z, style)
 
-    def strip(self, z0: float, z1: float, depth: float) -> None:
+    def strip(self, z0: float, z1: float, *, depth: float) -> None:
         """A moulding along the whole wall, extended by its depth so that the corners close."""
         width = self.width + 2 * depth
-        self.box(-depth, z0, width, z1 - z0, depth, self.front.trim, gap=0.005)
+        self.box(-depth, z0, self.front.trim, w=width, h=z1 - z0, depth=depth, gap=0.005)
 
     def add(
         self, storeys: int, rng: np.random.Generator, *, blank: bool, shop: bool, balconies: bool,
@@ -143,21 +143,21 @@ class Wall:
         if shop:
             self._shops(centres, pitch, door)
         else:
-            self._row(0.0, front.ground, left, w, 1.1, h, front.glass)
+            self._row(0.0, front.ground, left, front.glass, w=w, h=h, sill=1.1)
             self._sills(left, w, 1.1)
             self._door(centres[door] - 0.8)
         for level in range(1, storeys):
             z0 = front.ground + front.storey * (level - 1)
-            self._row(z0, z0 + front.storey, left, w, 0.85, h, front.glass)
+            self._row(z0, z0 + front.storey, left, front.glass, w=w, h=h, sill=0.85)
             self._sills(left, w, z0 + 0.85)
             if front.courses or level == 1:
-                self.strip(z0 - 0.1, z0 + 0.12, 0.10)
+                self.strip(z0 - 0.1, z0 + 0.12, depth=0.10)
             if balconies and bays >= 2:
                 self._balconies(centres[(level + np.arange(bays)) % 2 == 0], z0)
-        self.strip(height - 0.35, height, front.cornice)
+        self.strip(height - 0.35, height, depth=front.cornice)
 
     def _row(
-        self, z0: float, z1: float, xs: Array, w: float, sill: float, h: float, glass: int
+        self, z0: float, z1: float, xs: Array, glass: int, *, w: float, h: float, sill: float
     ) -> None:
         """Wall between two heights around equal windows whose left edges are at ``xs``."""
         b, front, u, n, recess = self.b, self.front, self.along, self.out, 0.18
@@ -175,17 +175,17 @@ class Wall:
 
     def _sills(self, xs: Array, w: float, z: float) -> None:
         """Sill boards below windows."""
-        self.box(xs - 0.1, z - 0.1, w + 0.2, 0.1, 0.14, self.front.trim, gap=0.01)
+        self.box(xs - 0.1, z - 0.1, self.front.trim, w=w + 0.2, h=0.1, depth=0.14, gap=0.01)
 
     def _door(self, x: float) -> None:
         """A house door with its frame, canopy and step."""
         trim = self.front.trim
         self.b.boxes(self.at(x, 0.0), 1.6 * self.along, -0.12 * self.out, 3.0 * Z, trim)
-        self.box(x, 0.0, 1.6, 3.05, 0.12, trim)
+        self.box(x, 0.0, trim, w=1.6, h=3.05, depth=0.12)
         leaf = self.at(x + 0.2, 0.16, -0.14)
         self.b.quads(leaf, 1.2 * self.along, 2.6 * Z, self.front.door)
-        self.box(x - 0.3, 3.05, 2.2, 0.15, 0.8, trim)
-        self.box(x - 0.1, 0.0, 1.8, 0.15, 0.9, trim)
+        self.box(x - 0.3, 3.05, trim, w=2.2, h=0.15, depth=0.8)
+        self.box(x - 0.1, 0.0, trim, w=1.8, h=0.15, depth=0.9)
 
     def _shops(self, centres: Array, pitch: float, door: int) -> None:
         """Ground floor with shop windows, a door, signs and awnings."""
@@ -193,9 +193,9 @@ class Wall:
         w = pitch - 0.6
         top = front.ground - 0.95
         left = centres - w / 2
-        self._row(0.0, front.ground, left, w, 0.45, top - 0.45, front.shop_glass)
+        self._row(0.0, front.ground, left, front.shop_glass, w=w, h=top - 0.45, sill=0.45)
         b.quads(self.at(left, front.ground - 0.8, -0.08), w * u, 0.6 * Z, front.sign, seed=5)
-        self.box(centres[door] - 0.6, 0.0, 1.2, 2.5, 0.1, front.trim)
+        self.box(centres[door] - 0.6, 0.0, front.trim, w=1.2, h=2.5, depth=0.1)
         b.quads(self.at(centres[door] - 0.5, 0.05, -0.12), u, 2.35 * Z, front.door)
         slope = 1.3 * self.out - 0.5 * Z
         for i, x in enumerate(left):

@@ -116,7 +116,7 @@ def lamp(name: str, base: Array, turn: float) -> Mesh:
     """Street lamp with an arm."""
     p = Placed(name, base, turn)
     iron = pal.metal_style(p, srgb(66, 74, 72))
-    light = pal.plain_style(p, srgb(230, 228, 210), 0.05)
+    light = pal.plain_style(p, srgb(230, 228, 210), strength=0.05)
     trunk(p, p.base, p.at(0, 0, 6.2), 0.11, iron)
     p.box((-0.06, -0.06, 6.1), (1.6, 0.12, 0.12), iron)
     p.box((0.9, -0.16, 5.98), (0.75, 0.32, 0.14), light, top=iron)
@@ -153,7 +153,7 @@ def stall(name: str, base: Array, turn: float, seed: int) -> Mesh:
             p.box((x, y, 0.0), (0.08, 0.08, 2.2), wood)
     p.box((-1.4, -1.0, 0.0), (2.8, 1.3, 0.85), wood)
     for i in range(6):
-        fruit = pal.plain_style(p, pal.pick(rng, pal.CLOTHS), 0.5, 0.15)
+        fruit = pal.plain_style(p, pal.pick(rng, pal.CLOTHS), strength=0.5, size=0.15)
         p.box((-1.35 + 0.46 * i, -0.95, 0.86), (0.4, 1.1, 0.16), fruit)
     ridge = [(-1.4, 2.15), (1.4, 2.15), (0.0, 2.95)]
     p.turn(turn + np.pi / 2)
@@ -166,7 +166,7 @@ def container(name: str, base: Array, turn: float, seed: int) -> Mesh:
     rng = rng_for(seed, name, "container")
     p = Placed(name, base, turn)
     color = pal.tint(rng, pal.pick(rng, (*pal.CLOTHS, srgb(70, 110, 80), srgb(120, 60, 40))))
-    sheet = pal.sheet_style(p, color, 0.3, True)
+    sheet = pal.sheet_style(p, color, rust=0.3, band=True)
     p.box((-3.0, -1.22, 0.1), (6.0, 2.44, 2.5), sheet)
     return p.build()
 
@@ -175,7 +175,7 @@ def fence(name: str, points: list[tuple[float, float]], z: float) -> Mesh:
     """Site fence along a path: posts and boards."""
     b = MeshBuilder(key_number(name))
     post = pal.plain_style(b, srgb(120, 120, 118))
-    board = pal.sheet_style(b, srgb(196, 198, 194), 0.25, False)
+    board = pal.sheet_style(b, srgb(196, 198, 194), rust=0.25, band=False)
     for (x0, y0), (x1, y1) in pairwise(points):
         start, along = np.array([x0, y0, z]), np.array([x1 - x0, y1 - y0, 0.0])
         length = float(np.linalg.norm(along))
@@ -231,7 +231,7 @@ def _lattice(p: Placed, low: Array, way: Array, wide: float, style: int) -> None
 def fountain(name: str, base: Array, radius: float) -> Mesh:
     """Round basin with a column."""
     p = Placed(name, base, 0.0)
-    stone = pal.plain_style(p, srgb(176, 168, 152), 0.35, 0.5)
+    stone = pal.plain_style(p, srgb(176, 168, 152), strength=0.35, size=0.5)
     water = p.style(WATER, srgb(60, 96, 110), srgb(96, 130, 140), reflect=0.1, sharp=0.6)
     turn = np.linspace(0, 2 * np.pi, 25)
     ring = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(25)])
@@ -252,8 +252,8 @@ def fountain(name: str, base: Array, radius: float) -> Mesh:
 def statue(name: str, base: Array) -> Mesh:
     """Stepped plinth with an obelisk."""
     p = Placed(name, base, 0.3)
-    stone = pal.plain_style(p, srgb(164, 156, 140), 0.35, 0.5)
-    bronze = pal.plain_style(p, srgb(88, 110, 92), 0.4, 0.3)
+    stone = pal.plain_style(p, srgb(164, 156, 140), strength=0.35, size=0.5)
+    bronze = pal.plain_style(p, srgb(88, 110, 92), strength=0.4, size=0.3)
     for i in range(3):
         r = 2.6 - 0.6 * i
         p.box((-r, -r, 0.25 * i), (2 * r, 2 * r, 0.26), stone, seed=i)

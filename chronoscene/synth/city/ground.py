@@ -54,7 +54,7 @@ class Rect:
         return np.array([self.x0 + fx * dx, self.y0 + fy * dy, z])
 
 
-def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Mesh:
+def floor(name: str, rect: Rect, surface: str, *, z: float = SLAB) -> Mesh:
     """A rectangle of ground.
 
     Args:

@@ -129,14 +129,14 @@ def flat_roof_style(b: MeshBuilder, rng: np.random.Generator) -> int:
     return b.style(tex.FLAT_ROOF, c, srgb(66, 66, 68), srgb(112, 106, 96), (1.1, gravel))
 
 
-def asphalt_style(b: MeshBuilder, marking: int, parking: float = 0.0) -> int:
+def asphalt_style(b: MeshBuilder, marking: int, *, parking: float = 0.0) -> int:
     """Style of a road; marking 0 none, 1 lanes, 2 zebra, 3 parking lot."""
     return b.style(
         tex.ASPHALT, srgb(84, 84, 88), srgb(112, 110, 108), srgb(224, 222, 212), (marking, parking)
     )
 
 
-def grass_style(b: MeshBuilder, season: str, wear: float, stripes: float = 0.0) -> int:
+def grass_style(b: MeshBuilder, season: str, *, wear: float, stripes: float = 0.0) -> int:
     """Style of a lawn in a season."""
     first, second, litter = GRASSES[season]
     return b.style(tex.GRASS, first, second, srgb(132, 110, 80), (wear, litter, stripes))
@@ -148,7 +148,7 @@ def leaf_style(b: MeshBuilder, season: str, species: int, size: float) -> int:
     return b.style(tex.LEAVES, c0, c1, c2, (size, 0.10), translucent=0.35)
 
 
-def soil_style(b: MeshBuilder, stones: float, ruts: float) -> int:
+def soil_style(b: MeshBuilder, *, stones: float, ruts: float) -> int:
     """Style of bare ground."""
     return b.style(tex.SOIL, *SOILS, (stones, ruts))
 
@@ -158,7 +158,7 @@ def metal_style(b: MeshBuilder, color: Color, dust: float = 0.15) -> int:
     return b.style(tex.PAINT, color, WHITE, srgb(130, 118, 100), (dust,), reflect=0.04, sharp=0.6)
 
 
-def plain_style(b: MeshBuilder, color: Color, strength: float = 0.25, size: float = 0.6) -> int:
+def plain_style(b: MeshBuilder, color: Color, *, strength: float = 0.25, size: float = 0.6) -> int:
     """Style of surfaces without a pattern."""
     dark = (0.8 * color[0], 0.8 * color[1], 0.8 * color[2])
     return b.style(tex.PLAIN, color, dark, None, (strength, size))
@@ -170,6 +170,6 @@ def wood_style(b: MeshBuilder, color: Color, board: float = 0.16) -> int:
     return b.style(tex.WOOD, color, dark, None, (board, 0.02))
 
 
-def sheet_style(b: MeshBuilder, color: Color, rust: float, band: bool) -> int:
+def sheet_style(b: MeshBuilder, color: Color, *, rust: float, band: bool) -> int:
     """Style of corrugated metal."""
     return b.style(tex.CORRUGATED, color, srgb(110, 62, 36), WHITE, (0.3, rust, float(band)))

@@ -58,21 +58,21 @@ class Block:
         """Add ground that never changes; see `floor`."""
         self.world.always(self.named(label), "ground", partial(floor, self.name, rect, surface))
 
-    def lawn(self, rect: Rect, label: str = "", kind: str = "lawn", z: float = SLAB) -> None:
+    def lawn(self, rect: Rect, label: str = "", *, kind: str = "lawn", z: float = SLAB) -> None:
         """Add grass that changes with the seasons."""
         name = self.named(label)
         states = [f"{kind} {season}" for season in self.world.seasons]
-        self.world.add(f"{name}/lawn", "lawn", states, lambda s: floor(name, rect, s, z))
+        self.world.add(f"{name}/lawn", "lawn", states, lambda s: floor(name, rect, s, z=z))
 
-    def plant(self, label: str, at: Array, size: float = 6.5, broad: bool = False) -> None:
+    def plant(self, label: str, at: Array, *, size: float = 6.5, broad: bool = False) -> None:
         """Add a tree that grows, and may be planted late or felled."""
         world = self.world
         height = float(self.rng.uniform(0.75, 1.25) * size)
         heights = tree_heights(self.rng, world.periods, height)
-        self.tree(label, at, heights, 2, broad)
+        self.tree(label, at, heights, detail=2, broad=broad)
 
     def tree(
-        self, label: str, at: Array, heights: Sequence[float | None], detail: int, broad: bool
+        self, label: str, at: Array, heights: Sequence[float | None], *, detail: int, broad: bool
     ) -> None:
         """Add a tree with the given height in each period; None where it is absent."""
         states = [
@@ -100,7 +100,7 @@ class Block:
         make = partial(hedge, name, low, high, self.world.seed)
         self.world.add(name, "tree", self.world.seasons, make)
 
-    def gravel_path(self, label: str, points: Array, width: float) -> None:
+    def gravel_path(self, label: str, points: Array, *, width: float) -> None:
         """Add a gravel path along a curve, slightly above the lawn."""
         way = np.gradient(points, axis=0)
         way /= np.linalg.norm(way, axis=1, keepdims=True)
@@ -133,7 +133,7 @@ class Block:
         )
 
     def park_cars(
-        self, label: str, places: list[tuple[float, float, float, float]], chance: float
+        self, label: str, places: list[tuple[float, float, float, float]], *, chance: float
     ) -> None:
         """Add parked cars: a place (x, y, z, heading) is empty or taken in each period."""
         periods = range(self.world.periods)
@@ -145,9 +145,10 @@ class Block:
             groups = [list(periods)] if stay else [[p] for p in periods]
             for k, group in enumerate(groups):
                 present = [p in group and bool(here[group[0]]) for p in periods]
-                self.car(f"{label}/car_{i}_{k}".lstrip("/"), np.array([x, y, z]), heading, present)
+                name = f"{label}/car_{i}_{k}".lstrip("/")
+                self.car(name, np.array([x, y, z]), heading=heading, present=present)
 
-    def car(self, label: str, at: Array, heading: float, present: Sequence[bool]) -> None:
+    def car(self, label: str, at: Array, *, heading: float, present: Sequence[bool]) -> None:
         self.put(label, "car", fur.car, at, heading, self.world.seed, present=present)
 
 
@@ -163,7 +164,7 @@ def curb_side(world: World, name: str, rect: Rect) -> None:
     for k in range(int((rect.size[1] - 10) // step)):
         y = rect.y0 + 8.0 + k * step
         places += [(rect.x0 - off, y, 0.0, np.pi / 2), (rect.x1 + off, y, 0.0, -np.pi / 2)]
-    block.park_cars("", places, 0.3 if world.near else 0.42)
+    block.park_cars("", places, chance=0.3 if world.near else 0.42)
     _lamps(block)
     _avenue(block)
 
@@ -191,6 +192,6 @@ def _avenue(block: Block) -> None:
         for i in range(int((length - 10) // 9.5)):
             at = a + (8.0 + 9.5 * i + rng.uniform(-0.5, 0.5)) / length * (b - a)
             label = f"avenue_{side}{i}"
-            make = partial(floor, block.named(label), Rect.around(at, 0.6), "soil", SLAB + 0.015)
+            make = partial(floor, block.named(label), Rect.around(at, 0.6), "soil", z=SLAB + 0.015)
             block.world.always(block.named(f"{label}/pit"), "ground", make)
-            block.plant(label, at, 5.6, broad=True)
+            block.plant(label, at, size=5.6, broad=True)

@@ -115,10 +115,10 @@ def _roles(settings: SynthSettings) -> dict[tuple[int, int], str]:
 def _add_roads(world: World, plan: Plan) -> None:
     """Add the roads between blocks, with junctions and zebra crossings."""
     b = MeshBuilder(key_number("roads"))
-    lanes, bare = pal.asphalt_style(b, 1, PARKING), pal.asphalt_style(b, 0)
+    lanes, bare = pal.asphalt_style(b, 1, parking=PARKING), pal.asphalt_style(b, 0)
     zebra = pal.asphalt_style(b, 2)
 
-    def add(axis: int, ends: Array, side: float, far: float, seed: int, core: bool) -> None:
+    def add(axis: int, ends: Array, *, side: float, far: float, seed: int, core: bool) -> None:
         """Add the road beside a block, along x (axis 0) or y (1); only the core has crossings."""
 
         def at(s: float, t: float, z: float = 0.0) -> Array:
@@ -138,12 +138,12 @@ def _add_roads(world: World, plan: Plan) -> None:
     between_rows = np.column_stack([rows[:-1, 1], rows[1:, 0]])
     for i, (x0, x1) in enumerate(between_columns):
         for j, ends in enumerate(rows):
-            add(1, ends, x1, x0, i, 0 < j < len(rows) - 1)
+            add(1, ends, side=x1, far=x0, seed=i, core=0 < j < len(rows) - 1)
         for j, (y0, y1) in enumerate(between_rows):
             b.quads([x0, y0, 0], (x1 - x0) * X, (y1 - y0) * Y, bare, seed=j)
     for j, (y0, y1) in enumerate(between_rows):
         for i, ends in enumerate(columns):
-            add(0, ends, y0, y1, j + 40, 0 < i < len(columns) - 1)
+            add(0, ends, side=y0, far=y1, seed=j + 40, core=0 < i < len(columns) - 1)
     world.always("roads", "ground", b.build)
 
 

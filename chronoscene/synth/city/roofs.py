@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -39,9 +39,12 @@ def add_roof(
     tiles, fascia = pal.roof_tile_style(b, rng), pal.wood_style(b, srgb(110, 84, 62))
     slope = float(rng.uniform(0.62, 0.9))
     if dx >= dy:
-        roof = _PitchedRoof(b, corner, X, Y, dx, dy, slope, tiles, fascia, wall)
+        o, a, c, length, depth = corner, X, Y, dx, dy
     else:
-        roof = _PitchedRoof(b, corner + dx * X, Y, -X, dy, dx, slope, tiles, fascia, wall)
+        o, a, c, length, depth = corner + dx * X, Y, -X, dy, dx
+    roof = _PitchedRoof(
+        b, o, a, c, length=length, depth=depth, slope=slope, tiles=tiles, fascia=fascia, wall=wall
+    )
     if kind == "hip":
         roof.add_hip()
     else:
@@ -116,6 +119,7 @@ class _PitchedRoof:
     o: Array
     a: Array
     c: Array
+    _: KW_ONLY
     length: float
     depth: float
     slope: float

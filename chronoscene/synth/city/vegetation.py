@@ -112,7 +112,7 @@ def tree(
     b = Foliage(name, rng)
     species = int(rng.choice(3, p=[0.45, 0.4, 0.15]))
     species = species % 2 if broad else species
-    bark = pal.plain_style(b, srgb(96, 78, 60), 0.5, 0.2)
+    bark = pal.plain_style(b, srgb(96, 78, 60), strength=0.5, size=0.2)
     leaf = pal.leaf_style(b, season, species, 0.24 if detail == 2 else 0.5)
     lean = rng.normal(0, 0.03, 2) * height
     top = base + np.array([lean[0], lean[1], 0.75 * height])

@@ -57,28 +57,34 @@ class Light:
 
 MOODS: tuple[Light, ...] = (
     Light(
-        "summer noon", "summer", -60.0, 54.0, (1.95, 1.86, 1.68), (0.13, 0.27, 0.60),
-        (0.50, 0.61, 0.72), 0.45, 1 / 2600, 0.74, (1.0, 1.0, 1.0),
+        "summer noon", "summer", azimuth=-60.0, elevation=54.0, cloud=0.45, haze=1 / 2600,
+        sun=(1.95, 1.86, 1.68), zenith=(0.13, 0.27, 0.60), horizon=(0.50, 0.61, 0.72),
+        exposure=0.74, white=(1.0, 1.0, 1.0),
     ),
     Light(
-        "warm evening", "summer", -158.0, 20.0, (2.60, 1.50, 0.68), (0.15, 0.21, 0.40),
-        (0.68, 0.51, 0.38), 0.55, 1 / 1500, 1.12, (1.05, 0.98, 0.86),
+        "warm evening", "summer", azimuth=-158.0, elevation=20.0, cloud=0.55, haze=1 / 1500,
+        sun=(2.60, 1.50, 0.68), zenith=(0.15, 0.21, 0.40), horizon=(0.68, 0.51, 0.38),
+        exposure=1.12, white=(1.05, 0.98, 0.86),
     ),
     Light(
-        "cool autumn morning", "autumn", 25.0, 27.0, (1.35, 1.38, 1.45), (0.24, 0.34, 0.52),
-        (0.52, 0.60, 0.68), 0.65, 1 / 1900, 0.86, (0.91, 0.99, 1.13),
+        "cool autumn morning", "autumn", azimuth=25.0, elevation=27.0, cloud=0.65, haze=1 / 1900,
+        sun=(1.35, 1.38, 1.45), zenith=(0.24, 0.34, 0.52), horizon=(0.52, 0.60, 0.68),
+        exposure=0.86, white=(0.91, 0.99, 1.13),
     ),
     Light(
-        "overcast spring", "spring", 95.0, 48.0, (0.35, 0.34, 0.33), (0.62, 0.66, 0.70),
-        (0.58, 0.61, 0.64), 0.95, 1 / 1400, 1.10, (0.97, 1.0, 1.03),
+        "overcast spring", "spring", azimuth=95.0, elevation=48.0, cloud=0.95, haze=1 / 1400,
+        sun=(0.35, 0.34, 0.33), zenith=(0.62, 0.66, 0.70), horizon=(0.58, 0.61, 0.64),
+        exposure=1.10, white=(0.97, 1.0, 1.03),
     ),
     Light(
-        "winter noon", "winter", -95.0, 19.0, (1.95, 1.66, 1.28), (0.16, 0.26, 0.50),
-        (0.50, 0.55, 0.62), 0.35, 1 / 1600, 1.10, (0.98, 1.0, 1.05),
+        "winter noon", "winter", azimuth=-95.0, elevation=19.0, cloud=0.35, haze=1 / 1600,
+        sun=(1.95, 1.66, 1.28), zenith=(0.16, 0.26, 0.50), horizon=(0.50, 0.55, 0.62),
+        exposure=1.10, white=(0.98, 1.0, 1.05),
     ),
     Light(
-        "spring morning", "spring", 40.0, 37.0, (1.95, 1.70, 1.35), (0.15, 0.28, 0.58),
-        (0.52, 0.58, 0.64), 0.50, 1 / 1700, 0.76, (1.02, 1.0, 0.97),
+        "spring morning", "spring", azimuth=40.0, elevation=37.0, cloud=0.50, haze=1 / 1700,
+        sun=(1.95, 1.70, 1.35), zenith=(0.15, 0.28, 0.58), horizon=(0.52, 0.58, 0.64),
+        exposure=0.76, white=(1.02, 1.0, 0.97),
     ),
 )  # fmt: skip
 """Lights in the order in which periods use them; neighbours differ in every respect."""
