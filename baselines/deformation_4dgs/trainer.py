@@ -34,8 +34,10 @@ class TwoStages(Timeline):
 
 
 class DeformationTrainer(GaussianTrainer):
-    """The second stage begins with a new optimiser and new statistics; that it has is known by
-    `DeformedModel.is_deforming`."""
+    """Trainer of both stages: the second begins with a new optimiser and new statistics.
+
+    `DeformedModel.is_deforming` records that it has begun.
+    """
 
     config: Deformation4DGSConfig
     model: DeformedModel

@@ -1,4 +1,4 @@
-"""Recipes for programs of others, which are installed on their own: commands and where files lie.
+"""Recipes for external programs, installed separately: commands and places of files.
 
 Written from the documentation and the sources of the programs; `Runner.tested` says what was tried.
 """

@@ -15,7 +15,7 @@ from chronoscene.training.views import downscale_image
 
 _STREAM = 7  # Keeps the coordinates apart from other draws of the same seed
 _UNKNOWN = 128
-"""Shown to the network where a photo does not count: the middle of its range."""
+"""Value of pixels that do not count, for the network: the middle of its range."""
 
 
 def start_coordinates(means: Tensor, box: float, seed: int) -> Tensor:

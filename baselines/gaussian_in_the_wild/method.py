@@ -25,7 +25,7 @@ from chronoscene.training.schedules import log_linear
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, NUM_BASES, basis
 
 _PHOTO = "photo."
-"""First letters of the tensors that a finished model does without."""
+"""Prefix of the tensors that a finished model does without."""
 
 
 class GaussianInTheWild(GaussianMethod):

@@ -1,2 +1,4 @@
-"""A model's tensors in few bytes: quantised, sorted, entropy coded; and back, from files that
-nobody vouches for. Works on NumPy arrays and knows no method."""
+"""Compression of a model's tensors: quantised, sorted, entropy coded. Reading trusts no file.
+
+Works on NumPy arrays and knows no method.
+"""

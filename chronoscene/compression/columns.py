@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 TURNED = 8
-"""Tensors with so many columns or more are turned."""
+"""Number of columns from which on tensors are rotated to their principal axes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,8 +20,7 @@ class Columns:
     steps: NDArray[np.float32]
     """[C]"""
     basis: NDArray[np.float16] | None
-    """The principal axes, where there are many columns: what is common to several is then in one.
-    [C, C]"""
+    """Principal axes of tensors with many columns, so that correlated columns share one. [C, C]"""
 
     @classmethod
     def of(cls, values: NDArray[np.floating]) -> Columns:

@@ -24,8 +24,8 @@ from chronoscene.training.gradients import centre_gradients, centres_count
 PARTS = 2  # Gaussians that a split one becomes
 
 Scatter = Callable[[dict[str, Tensor], GaussianConfig, np.random.Generator], None]
-"""Turns copies of Gaussians that are split into their parts, in place: each is smaller, and where
-the generator draws it."""
+"""Function that turns copies of split Gaussians into their parts, in place: smaller ones at places
+that the generator draws."""
 
 
 class GradientStatistics:

@@ -21,10 +21,10 @@ from chronoscene.gaussians.density import Round
 from chronoscene.gaussians.model import axes_of, dot, opacities_of, scales_of
 
 MAX_COPIES = 51
-"""Gaussians that may stand for one; where more are drawn, each is as one of so many."""
+"""Largest number of Gaussians that share a place; more are treated as this many."""
 
 MAX_OPACITY = 1 - 2.0**-22
-"""A Gaussian that is more opaque counts as this: nothing can be shared of one."""
+"""Larger opacities are treated as this: an opacity of 1 cannot be shared."""
 
 _GATE_OPACITY = 0.005  # Gaussians this faint move by half of the noise
 _GATE_STEEPNESS = 100.0

@@ -24,7 +24,7 @@ from chronoscene.training.method import SplattingMethod
 
 
 class GaussianMethod(SplattingMethod):
-    """Static Gaussians of one scene; a subclass names itself and says what it adds.
+    """Static Gaussians of one scene, to which subclasses add.
 
     A deformation field, for example, is a `GaussianModel` with `at_period`, made by `make_model`
     with its weights as shared tensors, and their learning rates.
@@ -73,7 +73,7 @@ class GaussianMethod(SplattingMethod):
         return self._make_trainer(train, seed)
 
     def extend(self, train: TrainingSet) -> None:
-        """Train the Gaussians there are further: schedules, density control and moments begin anew.
+        """Continue with the present Gaussians: schedules, density control and moments begin anew.
 
         The sparse points of the new period are not used.
         """

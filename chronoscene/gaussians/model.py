@@ -28,7 +28,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
 """Groups of parameters: name to the shape of one row."""
 
 MIN_SPACING = math.sqrt(1e-7)
-"""Points nearer to each other than this, in training units, start no smaller than it."""
+"""Smallest initial scale, in training units, however close the points are."""
 
 
 @dataclass(eq=False)
@@ -122,7 +122,7 @@ class _Exp(torch.autograd.Function):
 
 
 class _Sigmoid(torch.autograd.Function):
-    """``torch.sigmoid`` with the same care."""
+    """``torch.sigmoid`` whose bits do not depend on threads either."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ _UNREADABLE = (AttributeError, EOFError, ImportError, pickle.PickleError, TypeEr
 def inner(
     function: Callable[..., Any] | None = None, *, fast_math: bool = False, **options: Any
 ) -> Any:
-    """A function that only compiled code calls; without other ways in it compiles faster.
+    """Compile a function that only compiled code calls, which is faster without other entry points.
 
     Args:
         function: What to compile; without one, the decorator for these options is returned.
@@ -42,8 +42,7 @@ def inner(
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Part of a kernel that is always merged into its caller, so that vectors stay in registers;
-    with fast math."""
+    """Compile a function with fast math and always inline it, so that vectors stay in registers."""
     return inner(function, fast_math=True, forceinline=True)
 
 
@@ -54,7 +53,7 @@ def kernel(
     extras: Iterable[ModuleType] = (),
     **options: Any,
 ) -> Any:
-    """A function that Python calls, compiled when it is first called or loaded from disk.
+    """Compile a function that Python calls, when it is first called, or load it from disk.
 
     Numba looks at the age of the function's own file alone. A kernel is compiled again when
     anything changes in the function's folder, in this package or in the extras. An index on disk
@@ -88,7 +87,7 @@ def _njit_options(fast_math: bool) -> dict[str, Any]:
 
 @cache
 def source_stamp(folder: Path, *files: Path) -> str:
-    """Changes with the files, with the modules in the folder, and with those of this package."""
+    """Hash of some files, of the modules in a folder, and of those of this package."""
     modules = {*folder.glob("*.py"), *_FOLDER.glob("*.py"), *files}
     return sha256(b"".join(path.read_bytes() for path in sorted(modules))).hexdigest()
 

@@ -82,9 +82,9 @@ read_index, write_index = _make_read(types.int64, _I64), _make_write(types.int64
 
 @emitted(lambda array, offset, amount: types.int64(array, types.intp, types.int64))
 def fetch_add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Add to an element of an int64 array as one atomic step; what it was before.
+    """Add to an element of an int64 array atomically and return its old value.
 
-    What this thread wrote before is seen by a thread that sees the sum.
+    A thread that sees the sum also sees what this thread wrote before.
     """
     address = emit_address(context, builder, sig.args[0], *args[:2])
     return builder.atomic_rmw("add", address, args[2], "acq_rel")
@@ -92,14 +92,14 @@ def fetch_add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @emitted(lambda array, offset: types.int64(array, types.intp))
 def load_shared(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """An element of an int64 array that other threads change, as it is now."""
+    """Load an element of an int64 array that other threads change."""
     return builder.load_atomic(emit_address(context, builder, sig.args[0], *args), "acquire", 8)
 
 
 def _make_prefetch(write: int) -> Callable:
     @emitted(lambda memory, index: types.void(memory, types.intp))
     def prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Ask for the cache line around ``index``; harmless where nothing is."""
+        """Prefetch the cache line around ``index``; harmless beyond the end of the memory."""
         pointer = emit_address(context, builder, sig.args[0], *args)
         pointer = builder.bitcast(pointer, ir.IntType(8).as_pointer())
         kind = ir.FunctionType(ir.VoidType(), [pointer.type, I32, I32, I32])

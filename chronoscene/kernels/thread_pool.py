@@ -38,19 +38,19 @@ _sched_yield = numba.types.ExternalFunction("sched_yield", numba.types.int32())
 
 @inlined
 def draw(control: Any, phase: int) -> int:
-    """Number of a job that nobody else has; as many as there are or more when all are taken."""
+    """Draw the number of a job for this worker; too large a number when all are taken."""
     return fetch_add(control, _STRIDE * phase, 1)
 
 
 @inlined
 def finish(control: Any, phase: int) -> None:
-    """A drawn job is done."""
+    """Mark a drawn job as done."""
     fetch_add(control, _STRIDE * phase + _FINISHED, 1)
 
 
 @inner
 def wait_for(control, phase, jobs):
-    """Until all jobs of a phase are done."""
+    """Wait until all jobs of a phase are done."""
     looks = 0
     while load_shared(control, _STRIDE * phase + _FINISHED) < jobs:
         looks += 1
@@ -123,7 +123,7 @@ class _Pool:
             raise task.error
 
     def _close(self, task: _Task) -> None:
-        """Let nobody else begin, and wait for those who have: they write to our arrays."""
+        """Let no other worker begin, and wait for those that have: they write to our arrays."""
         with self._mutex:
             self._task = None
             active = int(self._shared[_ACTIVE])
@@ -174,7 +174,7 @@ class _Pool:
         raise AssertionError
 
     def _claim(self) -> tuple[_Task, int] | None:
-        """A place in the present task."""
+        """Claim a place in the present task; None if there is none."""
         with self._mutex:
             task = self._task
             if task is None or task.taken >= task.workers:
@@ -200,7 +200,7 @@ _pool = _Pool()
 
 
 def _forget() -> None:
-    """A forked child has none of its parent's threads."""
+    """Make a new pool in a forked child, which has none of its parent's threads."""
     global _pool
     _pool = _Pool()
 

@@ -159,7 +159,7 @@ def emit_add_pair_products(builder: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 def _like(*kinds: Any) -> Any:
-    """Type of the vectors among some types if they are all of one and the rest are numbers."""
+    """Return the type of the vectors; None unless they have one type and the rest are numbers."""
     vectors = [kind for kind in kinds if isinstance(kind, Vector)]
     numbers = [kind for kind in kinds if isinstance(kind, types.Number)]
     if len({v.name for v in vectors}) != 1 or len(vectors) + len(numbers) < len(kinds):
@@ -168,7 +168,7 @@ def _like(*kinds: Any) -> Any:
 
 
 def _promote(context: Any, builder: Any, kinds: Any, args: Any) -> tuple[Vector, list[Any]]:
-    """Numbers among the arguments as vectors like the others."""
+    """Turn numbers among the arguments into vectors like the others."""
     like = _like(*kinds)
 
     def promoted(kind: Any, value: Any) -> Any:

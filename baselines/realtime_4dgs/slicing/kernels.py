@@ -72,7 +72,7 @@ def _unit(quats, n):  # type: ignore[no-untyped-def]
 
 @inner(forceinline=True)
 def _exp(x):  # type: ignore[no-untyped-def]
-    """In float64, as all arithmetic here."""
+    """Exponential in float64, as all arithmetic here."""
     return math.exp(np.float64(x))
 
 

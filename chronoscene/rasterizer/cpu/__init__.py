@@ -79,7 +79,7 @@ def rasterize(inputs: Inputs) -> Rasterization:
 
 
 def _stack(parts: list[Tensor]) -> Tensor:
-    """Without a copy for the usual single camera."""
+    """Stack images, without a copy for the usual single camera."""
     return parts[0][None] if len(parts) == 1 else torch.stack(parts)
 
 
@@ -177,7 +177,7 @@ class Render(torch.autograd.Function):
 
 
 def _background_gradient(image_grad: Tensor, light: AnyArray) -> Tensor:
-    """Summed by numpy, whose order does not depend on the number of threads. [D]"""
+    """Gradient of the background, summed by numpy in an order independent of threads. [D]"""
     passed = image_grad.numpy() * light[..., None]
     return torch.from_numpy(passed.sum(axis=(0, 1), dtype=np.float64).astype(np.float32))
 

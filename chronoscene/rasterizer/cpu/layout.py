@@ -88,7 +88,7 @@ class View:
 
 
 def make_view(viewmat: AnyArray, K: AnyArray, inputs: Inputs) -> View:
-    """Numbers of one camera of the inputs as the kernels want them, from its float64 matrices."""
+    """Pack one camera of the inputs for the kernels, from its float64 matrices."""
     width, height = inputs.width, inputs.height
     fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     margin_x, margin_y = CLAMP_MARGIN * 0.5 * width / fx, CLAMP_MARGIN * 0.5 * height / fy
