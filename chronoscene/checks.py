@@ -25,14 +25,6 @@ def check_shape(name: str, array: Any, shape: Sequence[int | None]) -> None:
         )
 
 
-def check_at_least(name: str, value: float, low: float) -> None:
-    """Raise unless an option is ``low`` or more; NaN is not."""
-    if not value >= low:
-        raise ConfigError(
-            name, expected=f"at least {low}", found=str(value), todo="correct the value"
-        )
-
-
 def check_choice(
     place: str, value: str, known: Iterable[str], *, error: type[ChronoSceneError] = ConfigError
 ) -> str:

@@ -20,7 +20,7 @@ SPEC = MethodSpec(
     outputs=("rgb", "alpha", "depth"),
     devices=("cpu", "cuda"),
     method="baselines.gaussian_splatting.method:GaussianSplatting",
-    config="baselines.gaussian_splatting.config:GaussianSplattingConfig",
+    config="chronoscene.gaussians.config:GaussianConfig",
     presets={
         "paper": {},
         # One reset of the opacities, halfway through the growth; none where it is 500 steps long.

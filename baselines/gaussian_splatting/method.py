@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from baselines.gaussian_splatting.config import GaussianSplattingConfig
+from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.method import GaussianMethod
 
 
@@ -16,7 +16,7 @@ class GaussianSplatting(GaussianMethod):
     """
 
     name = "3dgs"
-    config_class = GaussianSplattingConfig
+    config_class = GaussianConfig
 
 
 class GaussianSplattingPeriod(GaussianSplatting):

@@ -7,9 +7,9 @@ import pytest
 from toy_scene import SHORT, mean_squared_error, toy_scene, train
 
 from baselines.gaussian_splatting import PERIOD_SPEC, SPEC
-from baselines.gaussian_splatting.config import GaussianSplattingConfig
 from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.errors import ConfigError
+from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.trainer import Timeline
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object
@@ -72,8 +72,8 @@ def test_equal_seeds_give_equal_bytes_for_any_number_of_threads(tmp_path):
 @pytest.mark.parametrize("preset", ["paper", "accurate", "balanced", "fast"])
 def test_presets_are_configurations(preset):
     config = build_config(SPEC, preset=preset)
-    assert isinstance(config, GaussianSplattingConfig)
-    assert (config == GaussianSplattingConfig()) == (preset == "paper")
+    assert isinstance(config, GaussianConfig)
+    assert (config == GaussianConfig()) == (preset == "paper")
     assert config.max_gaussians == 0
 
 
@@ -121,4 +121,4 @@ def test_the_variant_for_periods_renders_each_with_its_exposure():
 )
 def test_impossible_options_are_named(name, value):
     with pytest.raises(ConfigError, match=name):
-        GaussianSplattingConfig(**{name: value})
+        GaussianConfig(**{name: value})

@@ -7,9 +7,9 @@ import pytest
 import torch
 from toy_scene import HEIGHT, SHORT, WIDTH, mean_squared_error, toy_scene, train
 
-from baselines.gaussian_splatting.config import GaussianSplattingConfig
 from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.errors import CheckpointError
+from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.scene.similarity import Sim3
@@ -20,7 +20,7 @@ def test_saved_models_render_the_same(tmp_path):
     method = train(scene, replace(SHORT, iterations=40))
     assert method.model.sh_degree == 3
     method.save(tmp_path)
-    loaded = GaussianSplatting(GaussianSplattingConfig())
+    loaded = GaussianSplatting(GaussianConfig())
     loaded.load(tmp_path, device="cpu")
     assert loaded.config == method.config and loaded.size() == method.size()
     for view in scene.views[:3]:
@@ -36,14 +36,14 @@ def test_a_model_with_a_missing_group_is_refused(tmp_path):
     del method.model.parameters["quats"]
     method.save(tmp_path)
     with pytest.raises(CheckpointError, match="parameter groups"):
-        GaussianSplatting(GaussianSplattingConfig()).load(tmp_path, device="cpu")
+        GaussianSplatting(GaussianConfig()).load(tmp_path, device="cpu")
 
 
 def test_a_near_plane_is_trained_stored_and_rendered_with(tmp_path):
     scene = toy_scene()
     method = train(scene, replace(SHORT, iterations=3, near_plane=1.0))
     method.save(tmp_path)
-    loaded = GaussianSplatting(GaussianSplattingConfig())
+    loaded = GaussianSplatting(GaussianConfig())
     loaded.load(tmp_path, device="cpu")
     mine, theirs = method.render(scene.views[0], 0), loaded.render(scene.views[0], 0)
     assert np.array_equal(mine.rgb, theirs.rgb) and np.array_equal(mine.depth, theirs.depth)
@@ -58,7 +58,7 @@ def test_a_near_plane_in_world_units_is_that_of_the_training_frame_times_its_sca
     world = train(scene, replace(SHORT, iterations=3, near_plane=4.0, length_unit="world"))
     frame = train(scene, replace(SHORT, iterations=3, near_plane=1.0, length_unit="training"))
     world.save(tmp_path)
-    loaded = GaussianSplatting(GaussianSplattingConfig())
+    loaded = GaussianSplatting(GaussianConfig())
     loaded.load(tmp_path, device="cpu")
     images = [m.render(scene.views[0], 0).rgb for m in (world, frame, loaded)]
     assert np.array_equal(images[0], images[1]) and np.array_equal(images[0], images[2])
@@ -76,7 +76,7 @@ class Painted(GaussianMethod):
     """The least that a method with a field has to write."""
 
     name = "painted"
-    config_class = GaussianSplattingConfig
+    config_class = GaussianConfig
 
     def make_model(self, parameters, train, seed):
         periods = 1 + max(view.period for view in train.views)

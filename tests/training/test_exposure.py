@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.gaussian_splatting.config import GaussianSplattingConfig
 from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.errors import ConfigError
+from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.scene.similarity import Sim3
@@ -167,7 +167,7 @@ def test_static_gaussians_show_periods_as_bright_as_their_photos(tmp_path):
     """Here the period decides on nothing but the exposure."""
     set_threads(1)
     scene = wall_of((1.0, 0.6))
-    config = GaussianSplattingConfig(
+    config = GaussianConfig(
         iterations=150, stretch=True, densify_from=30_000, reset_interval=30_000
     )
     errors = {}

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from baselines.gaussian_splatting.config import GaussianSplattingConfig
 from baselines.gaussian_splatting.method import GaussianSplatting
+from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.scene.similarity import Sim3
@@ -13,7 +13,7 @@ from chronoscene.training.drawing import Splats, draw
 WIDTH, HEIGHT = 48, 36
 EXTENT = 1.1
 
-SHORT = GaussianSplattingConfig(
+SHORT = GaussianConfig(
     iterations=250, stretch=True, reset_interval=30_000, densify_interval=25, max_gaussians=300
 )
 
