@@ -44,7 +44,7 @@ def read_views(
     predicted, truth = read_manifest(predictions), read_manifest(ground_truth)
     for entry, target in match_views(predictions, predicted, truth, stage=stage):
         if entry.rendered_period == entry.camera_period:
-            prediction = load_image(predictions, entry).astype(np.float32) / 255
-            photo = load_image(ground_truth, target).astype(np.float32) / 255
+            prediction = load_image(predictions, entry).astype(np.float32) / np.float32(255)
+            photo = load_image(ground_truth, target).astype(np.float32) / np.float32(255)
             mask = load_mask(ground_truth, target)
             yield PredictedView(entry.view, entry.camera_period, prediction, photo, mask)

@@ -59,21 +59,21 @@ from chronoscene.scene import Frame, Scene
 
 @dataclass(frozen=True, slots=True)
 class PartOutcome:
-    """What training and rendering one model, or one stage of it, gave."""
+    """Result of training and rendering one model, or one stage of it."""
 
     trained: LoopState
     folder: Path
-    """Of the saved model."""
+    """Folder of the saved model."""
     size: MethodSize
     render_seconds: float
-    """For all its test views together, by the model as it was saved and loaded again."""
+    """Time for all its test views together, by the model as it was saved and loaded again."""
     drawn: int | None
-    """Sum over its test views; None if the method does not say."""
+    """Gaussians drawn, sum over its test views; None if the method does not report them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Where the run takes place."""
+    """Device and threads of the run."""
 
     device: str
     threads: int
@@ -335,7 +335,7 @@ def _record(
 
 
 def _skips(job: Job, record: records.RunRecord) -> list[str]:
-    """What to say of steps that taught nothing."""
+    """Return notices on steps that changed nothing."""
     reasons = {
         "empty: their photos show nothing of the model": record.empty_steps,
         "skipped: their loss or gradients were not finite": record.skipped_steps,

@@ -9,7 +9,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from chronoscene.bench.use.changes import ChangeMap, changes_csv, changes_table, map_run
+from chronoscene.bench.use.change_scores import changes_csv, changes_table, map_run
+from chronoscene.bench.use.changes import ChangeMap
 from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.cli.options import DEVICE, PATH, RUN, SCENE
 from chronoscene.cli.output import emit, report_written, terminal_width

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from chronoscene.training.periods import with_new_periods
 class Config(GaussianConfig):
     """Options beside those of all methods with Gaussians, and other defaults of these."""
 
-    length_unit: str = "training"
+    length_unit: Literal["world", "training"] = "training"
     """The unit of the scene does not matter then."""
     stretch: bool = True
     """The schedule is as long as the training."""
