@@ -121,7 +121,7 @@ def _copy(old_path: Path, new_path: Path, wanted: Record) -> int:
             if a not in names or b not in names or names[a] > names[b]:
                 continue
             if old.verification(a, b) == new.verification(names[a], names[b]):
-                to = sorted((new.ids[names[a]], new.ids[names[b]]))
+                to = new.pair(names[a], names[b])
                 target.write_matches(*to, source.read_matches(i, j))
                 geometry = source.read_two_view_geometry(i, j)
                 for camera, image in zip((geometry.camera1, geometry.camera2), to, strict=True):
@@ -152,6 +152,11 @@ class _Cameras:
         self.ids = {str(image.name): int(image.image_id) for image in images}
         self.names = {i: name for name, i in self.ids.items()}
         self.camera_ids = {int(image.image_id): int(image.camera_id) for image in images}
+
+    def pair(self, first: str, second: str) -> tuple[int, int]:
+        """Ids of two images in the order of COLMAP."""
+        a, b = sorted((self.ids[first], self.ids[second]))
+        return a, b
 
     def verification(self, first: str, second: str) -> tuple[Any, ...]:
         """Everything that the geometry of a pair depends on, apart from its features."""

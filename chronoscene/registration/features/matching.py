@@ -94,7 +94,7 @@ def _store_matches(
     """
     with pycolmap.Database.open(database) as opened:
         ids = {str(image.name): int(image.image_id) for image in opened.read_all_images()}
-        ordered = {pair: sorted((ids[pair[0]], ids[pair[1]])) for pair in pairs}
+        ordered = {(a, b): (min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in pairs}
         new = [pair for pair in pairs if not opened.exists_matches(*ordered[pair])]
         used = sorted({i for pair in new for i in ordered[pair]})
         descriptors = {i: Descriptors.of(opened.read_descriptors(i).data) for i in used}

@@ -173,7 +173,11 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
                 path, number, "three world coordinates, or none", f"{len(world)}", _TODO_CSV
             )
         xyz = [_number(path, number, text, "a world coordinate") for text in world]
-        yield point, Click(image, *xy, line=number), (xyz[0], xyz[1], xyz[2]) if xyz else None
+        yield (
+            point,
+            Click(image, xy[0], xy[1], line=number),
+            (xyz[0], xyz[1], xyz[2]) if xyz else None,
+        )
 
 
 def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | None:
