@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -45,9 +44,28 @@ def command() -> None:
     For what is missing, it says what to install and why. The exit status is 1 if no method can be
     trained here, else 0. Nothing is downloaded.
     """
-    diagnoses = [check() for check in CHECKS]
+    system = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    diagnoses = [
+        Diagnosis("chronoscene", "ok", f"{__version__}, {system}"),
+        _needed("torch", f"{CPU_TORCH}, or a CUDA build from pytorch.org; all methods need it"),
+        _kernels(),
+        _needed(
+            "COLMAP",
+            "pip install pycolmap; without it no scene can be read",
+            module="chronoscene.io.pycolmap",
+            package="pycolmap",
+        ),
+        _cuda(),
+        _gsplat(),
+        _open3d(),
+        _lpips(),
+        _video(),
+        Diagnosis("processors", "ok", f"{available_threads()} of {os.cpu_count()}"),
+        Diagnosis("memory", "ok", in_words(machine_memory()[0])),
+        Diagnosis("disk", "ok", f"{in_words(shutil.disk_usage(Path.cwd()).free)} free here"),
+    ]
     heads = [(head, "") for head in ("part", "state", "found")]
-    rows = [(diagnosis.what, diagnosis.state, diagnosis.found) for diagnosis in diagnoses]
+    rows = [(d.what, d.state, d.found) for d in diagnoses]
     table = Table(heads, rows, labels=len(heads), title="What works on this machine")
     emit(plain_text(table) + "\n", None)
     for diagnosis in diagnoses:
@@ -58,20 +76,9 @@ def command() -> None:
         click.get_current_context().exit(CANNOT_RUN)
 
 
-def _program() -> Diagnosis:
-    system = f"{platform.system()} {platform.machine()}"
-    found = f"{__version__}, Python {platform.python_version()}, {system}"
-    return Diagnosis("chronoscene", "ok", found)
-
-
-def _torch() -> Diagnosis:
-    todo = f"{CPU_TORCH}, or a CUDA build from pytorch.org; all methods need it"
-    return _needed("torch", "torch", todo)
-
-
 def _kernels() -> Diagnosis:
     todo = "pip install numba; the rasterizer and the methods are compiled with it"
-    if (diagnosis := _needed("kernels", "numba", todo)).state != "ok":
+    if (diagnosis := _needed("kernels", todo, package="numba")).state != "ok":
         return diagnosis
     from chronoscene.kernels.compilation import kernel
 
@@ -90,16 +97,12 @@ def _kernels() -> Diagnosis:
     )
 
 
-def _colmap() -> Diagnosis:
-    todo = "pip install pycolmap; without it no scene can be read"
-    return _needed("COLMAP", "chronoscene.io.pycolmap", todo, package="pycolmap")
-
-
-def _needed(what: str, module: str, todo: str, *, package: str = "") -> Diagnosis:
-    """Check a module without which nothing is trained."""
+def _needed(what: str, todo: str, *, module: str = "", package: str = "") -> Diagnosis:
+    """Check a module without which nothing is trained; by default all have the same name."""
+    package = package or what
     try:
-        import_module(module)
-        return Diagnosis(what, "ok", f"{package or module} {version(package or module)}")
+        import_module(module or package)
+        return Diagnosis(what, "ok", f"{package} {version(package)}")
     except (ImportError, OSError, PackageNotFoundError) as error:
         return Diagnosis(what, "needed", str(error).splitlines()[0], todo)
 
@@ -152,33 +155,3 @@ def _video() -> Diagnosis:
     if find_spec("av") is None:
         return Diagnosis("video", "missing", "not installed", "pip install av; MP4 files need it")
     return Diagnosis("video", "ok", f"av {version('av')}")
-
-
-def _processors() -> Diagnosis:
-    found = f"{available_threads()} of {os.cpu_count()}"
-    return Diagnosis("processors", "ok", found)
-
-
-def _memory() -> Diagnosis:
-    return Diagnosis("memory", "ok", in_words(machine_memory()[0]))
-
-
-def _disk() -> Diagnosis:
-    return Diagnosis("disk", "ok", f"{in_words(shutil.disk_usage(Path.cwd()).free)} free here")
-
-
-CHECKS: tuple[Callable[[], Diagnosis], ...] = (
-    _program,
-    _torch,
-    _kernels,
-    _colmap,
-    _cuda,
-    _gsplat,
-    _open3d,
-    _lpips,
-    _video,
-    _processors,
-    _memory,
-    _disk,
-)
-"""In the order of the table."""

@@ -14,6 +14,7 @@ import re
 import struct
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -78,23 +79,20 @@ class ExifData:
 
 def read_exif(path: Path) -> ExifData:
     """Read the metadata of a photo; empty for a file that is not an image. Never raises."""
-    try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore")
+    with suppress(Exception), warnings.catch_warnings():  # Pillow raises almost anything
+        warnings.simplefilter("ignore")
+        with Image.open(path) as image:
             return exif_of(image)
-    except Exception:  # Pillow raises almost anything for damaged files
-        return ExifData()
+    return ExifData()
 
 
 def exif_of(image: Image.Image) -> ExifData:
     """Read the metadata of an open image. Never raises."""
-    try:
+    with suppress(Exception):  # damaged metadata raises almost anything, with intact pixels
         tags = Image.Image.getexif(image)  # the one of PNG files would decode the pixels
-        if not tags and "xmp" not in image.info:
-            return ExifData()
-        return _parse(tags, _drone(image.info.get("xmp")))
-    except Exception:  # damaged metadata raises almost anything, and says nothing about the pixels
-        return ExifData()
+        if tags or "xmp" in image.info:
+            return _parse(tags, _drone(image.info.get("xmp")))
+    return ExifData()
 
 
 def taken_at(path: Path, exif: ExifData) -> datetime | None:
@@ -114,10 +112,9 @@ def capture_times(images: Path, names: Iterable[str]) -> dict[str, datetime | No
 
 
 def _ifd(tags: Image.Exif, key: int) -> Mapping[int, Any]:
-    try:
+    with suppress(Exception):  # one damaged directory must not hide the others
         return tags.get_ifd(key)
-    except Exception:  # one damaged directory must not hide the others
-        return {}
+    return {}
 
 
 def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
@@ -159,12 +156,10 @@ def _drone(xmp: Any) -> DroneData | None:
         found = re.search(pattern, text)
         return _number(found[1]) if found else None
 
-    deviations = [value(f"RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt")]
-    known = [deviation for deviation in deviations if deviation is not None]
-    return DroneData(
-        relative_altitude=value("RelativeAltitude"),
-        rtk_std=(known[0], known[1], known[2]) if len(known) == 3 else None,
-    )
+    lon, lat, height = (value(f"RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt"))
+    if lon is None or lat is None or height is None:
+        return DroneData(value("RelativeAltitude"))
+    return DroneData(value("RelativeAltitude"), (lon, lat, height))
 
 
 def _date(value: Any) -> datetime | None:
@@ -201,9 +196,8 @@ def _degrees(value: Any, ref: Any, negative: str, limit: float) -> float | None:
     """Combine degrees, minutes and seconds in one signed number."""
     if not isinstance(value, tuple | list) or not 1 <= len(value) <= 3:
         return None
-    parts = [_number(part) for part in value]
     degrees = 0.0
-    for i, part in enumerate(parts):
+    for i, part in enumerate(map(_number, value)):
         if part is None or part < 0:
             return None
         degrees += part / 60**i
@@ -213,11 +207,10 @@ def _degrees(value: Any, ref: Any, negative: str, limit: float) -> float | None:
 
 
 def _number(value: Any) -> float | None:
-    try:
+    with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
         number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return number if math.isfinite(number) else None
+        return number if math.isfinite(number) else None
+    return None
 
 
 def _positive(number: Number | None) -> Number | None:

@@ -2,16 +2,10 @@
 
 `run_worker` calls a function in a fresh interpreter. The job goes in as JSON, progress and the
 result come back as lines of JSON, and large results stay in files. The worker ends when its parent
-does, even if the parent is killed; a crash of the worker is reported and harms nothing else. Runs
-of a bench and steps of a registration go through it.
+does, even if the parent is killed, with all programs that it started; a crash of the worker is
+reported and harms nothing else. `map_parallel` maps a function over items in a pool.
 
-A worker may start programs of others. `process_tree` finds all that they started, and
-`end_processes` ends it: so it is done where a worker is interrupted or loses its parent.
-
-`map_parallel` maps a function over items in a pool. The commands use it for folders of scenes.
-
-Modules that are needed only once work starts are imported inside functions: ``chronoscene --help``
-loads this module.
+Some modules are imported inside functions: ``chronoscene --help`` loads this module.
 """
 
 from __future__ import annotations
@@ -45,21 +39,19 @@ Report = Callable[[str, int, int], None]
 def stoppable() -> Iterator[None]:
     """Turn SIGTERM, which batch systems send, into an exit that cleans up unfinished work."""
 
-    def stop(number: int, frame: object) -> None:
+    def exit_with(number: int, frame: object) -> None:
         raise SystemExit(128 + number)
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, stop)
+    before = signal.signal(signal.SIGTERM, exit_with)
     try:
         yield
     finally:
         # None stands for a handler that was not set in Python, which cannot be put back.
         signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
-
-# Everything that a process started
 
 GRACE = 5.0  # Seconds that a program has to end after SIGTERM: a container is stopped in them
 
@@ -99,9 +91,6 @@ def end_processes(roots: Iterable[int], *, grace: float = GRACE) -> None:
         time.sleep(0.05)
 
 
-# One worker, one job
-
-
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """End of a worker."""
@@ -124,14 +113,14 @@ class Outcome:
 
 
 class Stop:
-    """Ends the workers for which threads wait, as an interruption reaches the main thread alone."""
+    """Ends the workers that threads wait for: an interruption reaches the main thread alone."""
 
     def __init__(self) -> None:
         self.asked = False
         self.workers: set[Popen[str]] = set()
 
     def ask(self) -> None:
-        """End all workers; who waits for one, or wants to start another, gets a SystemExit."""
+        """End all workers; waiting for one, or starting another, raises a SystemExit."""
         self.asked = True
         for process in tuple(self.workers):
             _end(process)
@@ -162,12 +151,11 @@ def run_worker(
 ) -> Outcome:
     """Call a function in a process of its own and wait for its end.
 
-    If waiting is interrupted, the worker is killed, and all that it started is ended: it must leave
-    nothing behind that its caller does not clean up.
+    If waiting is interrupted, the worker is killed, and all that it started is ended.
 
     Args:
-        function: ``module:name``. Takes the job and a `Report`; returns what JSON can hold.
-        job: What JSON can hold.
+        function: ``module:name``. Takes the job and a `Report`; returns a value for JSON.
+        job: A value for JSON.
         report: Called with the progress that the worker reports.
         stop: Ends the worker, if the caller waits in another thread than the main one.
         log: File for everything that the worker and its libraries print; None for our stderr.
@@ -224,10 +212,7 @@ def _listen(process: Popen[str], report: Report | None) -> dict[str, Any] | None
 
 
 def _end_with(parent: int) -> None:
-    """End this process and what it started when its parent is gone.
-
-    Another one may already write to its folder.
-    """
+    """End this process and what it started when its parent is gone, as another may take over."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -239,7 +224,7 @@ def _end_with(parent: int) -> None:
 
 
 def main() -> None:
-    """The worker: read the job from stdin, call the function, send progress and its result."""
+    """Run the worker: read the job from stdin, call the function, send progress and its result."""
     import importlib
 
     _end_with(int(sys.argv[2]))
@@ -260,9 +245,6 @@ def main() -> None:
         send({"error": error.fields})
     except KeyboardInterrupt:  # the parent has it, too
         sys.exit(130)
-
-
-# A pool, many items
 
 
 def map_parallel(
@@ -303,12 +285,12 @@ def map_parallel(
                 yield from _pooled(function, [item], 1)
             except BrokenProcessPool as error:
                 if lost is None:
+                    todo = "it may have run out of memory: close programs, or pass fewer at a time"
                     raise ChronoSceneError(
                         item,
                         expected="the process to finish",
                         found="a process that died",
-                        todo="it may have run out of memory: close other programs, or pass fewer "
-                        "at a time",
+                        todo=todo,
                     ) from error
                 yield lost(item)
 

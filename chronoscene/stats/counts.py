@@ -86,10 +86,9 @@ class Unreadable:
 
 def period_name(period: int, label: str, date: str | None) -> str:
     """Name a period by label, and date where the label lacks the year, else by number."""
-    names = [label] if label != str(period) else []
-    if date is not None and date[:4] not in label:
-        names.append(date)
-    return ", ".join(names) or str(period)
+    named = label if label != str(period) else ""
+    dated = date if date is not None and date[:4] not in label else ""
+    return ", ".join(filter(None, (named, dated))) or str(period)
 
 
 def period_title(period: int, label: str, date: str | None) -> str:
@@ -132,18 +131,22 @@ def count_scene(
         split_rule=scene.split_rule,
         split_hash=split_hash(scene),
         count=count,
-        periods=tuple(_count_period(scene, i, int(n)) for i, n in enumerate(by_period)),
+        periods=tuple(
+            PeriodCount(
+                id=period.id,
+                label=period.label,
+                date=period.date,
+                images=len(scene.select(period=period.id)),
+                train=len(scene.select(split="train", period=period.id)),
+                test=len(scene.select(split="test", period=period.id)),
+                points=int(points),
+            )
+            for period, points in zip(scene.periods, by_period, strict=True)
+        ),
         images=len(scene.frames),
         points=len(scene.points),
         points_without_period=int((np.diff(scene.points.track_start) == 0).sum()),
     )
-
-
-def _count_period(scene: Scene, period: int, points: int) -> PeriodCount:
-    info = scene.periods[period]
-    train = len(scene.select(split="train", period=period))
-    test = len(scene.select(split="test", period=period))
-    return PeriodCount(period, info.label, info.date, train + test, train, test, points)
 
 
 def count_table(counts: Sequence[SceneCount]) -> list[list[int | str | None]]:
@@ -152,14 +155,14 @@ def count_table(counts: Sequence[SceneCount]) -> list[list[int | str | None]]:
     The last row holds the totals; None stands where a scene has no such period.
     """
     periods = max((len(c.periods) for c in counts), default=0)
-    rows: list[list[int | str | None]] = []
-    sums = [0] * (2 * periods + 2)
+    rows: list[list[int | None]] = []
     for scene in counts:
         cells: list[int | None] = [n for p in scene.periods for n in (p.images, p.points)]
-        cells += [None] * (2 * periods - len(cells)) + [scene.images, scene.points]
-        sums = [total + (cell or 0) for total, cell in zip(sums, cells, strict=True)]
-        rows.append([scene.name, *cells])
-    return [*rows, ["Total", *sums]]
+        rows.append([*cells, *[None] * (2 * periods - len(cells)), scene.images, scene.points])
+    empty = [0] * (2 * periods + 2)
+    sums = [sum(cell or 0 for cell in column) for column in zip(empty, *rows, strict=True)]
+    names = [*(scene.name for scene in counts), "Total"]
+    return [[name, *cells] for name, cells in zip(names, [*rows, sums], strict=True)]
 
 
 def _period_names(counts: Sequence[SceneCount]) -> list[str]:

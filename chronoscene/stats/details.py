@@ -83,10 +83,6 @@ def rows_of(statistics: SceneStatistics) -> list[DetailRow]:
     ]
 
 
-def _max_periods(statistics: Sequence[SceneStatistics]) -> int:
-    return max((len(s.periods) for s in statistics), default=0)
-
-
 def format_details(
     statistics: Sequence[SceneStatistics],
     style: str,
@@ -111,7 +107,7 @@ def _csv(statistics: Sequence[SceneStatistics]) -> str:
 
     The number of the period is empty for a whole scene, so that the column is of numbers.
     """
-    periods = _max_periods(statistics)
+    periods = max((len(s.periods) for s in statistics), default=0)
     shares = [f"{what}_{i}" for what in ("overlap", "in_view") for i in range(periods)]
     lines = []
     for row in (row for scene in statistics for row in rows_of(scene)):
@@ -137,7 +133,7 @@ def _scene_item(statistics: SceneStatistics) -> dict[str, Any]:
 
 def _table(statistics: Sequence[SceneStatistics]) -> Table:
     """Make the table for readers, with a rule after each scene but the last."""
-    periods = _max_periods(statistics)
+    periods = max((len(s.periods) for s in statistics), default=0)
     shown = periods if 1 < periods <= MAX_SHOWN else 0
     titles = [
         (title if i == 0 else "", f"{i} [%]")
@@ -145,17 +141,14 @@ def _table(statistics: Sequence[SceneStatistics]) -> Table:
         for i in range(shown)
     ]
     heads = [("Scene", ""), ("Period", ""), *(c.head for c in COLUMNS), *titles]
-    lines: list[list[str]] = []
-    breaks = set()
-    for scene in statistics:
-        if lines:
-            breaks.add(len(lines) - 1)
-        for row in rows_of(scene):
-            name = row.scene if row.period == 0 else ""
-            cells = [c.show(row.values[c.name]) for c in COLUMNS]
-            for shares in (row.overlap, row.in_view):
-                cells += [_percent(row, shares, i) for i in range(shown)]
-            lines.append([name, row.title, *cells])
+    rows = [row for scene in statistics for row in rows_of(scene)]
+    lines = []
+    for row in rows:
+        cells = [c.show(row.values[c.name]) for c in COLUMNS]
+        for shares in (row.overlap, row.in_view):
+            cells += [_percent(row, shares, i) for i in range(shown)]
+        lines.append([row.scene if row.period == 0 else "", row.title, *cells])
+    breaks = [i for i, row in enumerate(rows[:-1]) if row.period is None]
     return Table(heads, lines, labels=2, breaks=breaks)
 
 

@@ -221,7 +221,7 @@ def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> Data
     ]
     keys = ["scene", "label", "quantity", "column"]
     values = pd.DataFrame(numbers, columns=[*keys, "value", "resampled"]).groupby(keys, sort=False)
-    entries = values.value.agg(mean=mean, sd=_spread, n="size")
+    entries = values.value.agg(mean=mean, sd=spread, n="size")
     entries["resampled"] = [np.mean(list(part), axis=0) for _, part in values.resampled]
     entries = entries.reset_index().join(groups, on=["scene", "label"])
     order = {scene: i for i, scene in enumerate(dict.fromkeys(run.scene for run in records))}
@@ -423,8 +423,8 @@ def _scores(
         yield metric, name, value, spread if np.shape(spread) else UNKNOWN
 
 
-def _spread(values: Series) -> float:
-    """Sample standard deviation (n - 1); NaN for one value, or where one is infinite."""
+def spread(values: Series) -> float:
+    """Compute the sample standard deviation (n - 1); NaN for one value, or with an infinite one."""
     return stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
 
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from statistics import mean, stdev
+from statistics import mean
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.bench.files.records import CURVE_FILE, CurvePoint, RunRecord, read_lines
 from chronoscene.bench.files.strategies import STRATEGIES
-from chronoscene.bench.report.summary import labelled, with_spread
+from chronoscene.bench.report.summary import labelled, spread, with_spread
 from chronoscene.bench.report.tables import ALL_SCENES
 from chronoscene.io.tables import Table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 LADDER = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 18000, 36000, 86400)
 """Seconds after which the PSNR is asked for, as far as a training lasts so long."""
@@ -27,23 +30,14 @@ Curve = NDArray[np.float64]
 """Seconds and PSNR of the probes of a run. [2, K]"""
 
 
-@dataclass(frozen=True, slots=True)
-class CurveValue:
-    """A number that curves give for a configuration, a mean over its seeds."""
+VALUE_COLUMNS = ("scene", "device", "label", "quantity", "at", "mean", "sd", "n")
+"""Columns of `curve_values`, one row per configuration and number that its curves give.
 
-    scene: str
-    """Or `ALL_SCENES`."""
-    device: str
-    label: str
-    quantity: str
-    """``psnr``: after ``at`` seconds of training. ``seconds``: until ``at`` dB are reached.
-    ``psnr_end`` and ``seconds_end``: of the last probe. ``gain``: from half of the time of the last
-    probe to that."""
-    at: float | None
-    mean: float
-    sd: float | None
-    """Sample standard deviation over the seeds; None for one."""
-    n: int
+``scene`` may be `ALL_SCENES`. ``quantity`` is ``psnr`` (after ``at`` seconds of training),
+``seconds`` (until ``at`` dB are reached), ``psnr_end`` and ``seconds_end`` (of the last probe), or
+``gain`` (from half of the time of the last probe to that). ``mean`` is over ``n`` seeds; ``sd``,
+their sample standard deviation, is None for one.
+"""
 
 
 def read_curve(folder: Path) -> list[CurvePoint]:
@@ -93,34 +87,62 @@ def seconds_until(curve: Curve, psnr: float) -> float:
     return float(np.interp(psnr, values, times))
 
 
-def curve_values(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -> list[CurveValue]:
+def curve_values(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -> DataFrame:
     """Read numbers off curves by device, scene and configuration; what a seed lacks is left out.
 
     Args:
         records: Runs of any scenes.
         curves: One for each of them.
+
+    Returns:
+        `VALUE_COLUMNS`.
     """
+    import pandas as pd
+
     known = [(run, curve) for run, curve in zip(records, curves, strict=True) if curve is not None]
-    if not known:
-        return []
-    levels = psnr_levels([curve for _, curve in known])
-    found: list[CurveValue] = []
+    parts = [pd.DataFrame(columns=VALUE_COLUMNS)]
+    levels = psnr_levels([curve for _, curve in known]) if known else []
     for device in dict.fromkeys(run.device for run, _ in known):
         here = [(run, curve) for run, curve in known if run.device == device]
-        labels = labelled([run for run, _ in here]).label
-        groups: dict[tuple[str, str], list[Curve]] = {}
-        for (run, curve), label in zip(here, labels, strict=True):
-            groups.setdefault((run.scene, label), []).append(curve)
-        single = [
-            value
-            for (scene, label), seeds in groups.items()
-            for value in _of_seeds(scene, device, label, seeds, levels)
+        numbers = [
+            (run.scene, device, label, *number)
+            for (run, curve), label in zip(here, labelled([r for r, _ in here]).label, strict=True)
+            for number in _numbers(curve, levels)
         ]
-        scenes = {value.scene for value in single}
-        found += single
-        if len(scenes) > 1:
-            found += _over_scenes(single, len(scenes))
-    return found
+        *keys, _, _, _ = VALUE_COLUMNS
+        seeds = pd.DataFrame(numbers, columns=[*keys, "value"])
+        seeds = seeds.groupby(keys, sort=False, dropna=False).value
+        values = seeds.agg(mean=mean, sd=spread, n="size").reset_index()
+        parts.append(values[np.isfinite(values["mean"])])
+        if parts[-1].scene.nunique() > 1:
+            parts.append(_over_scenes(parts[-1]).assign(scene=ALL_SCENES, device=device))
+    found = pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
+    found = found[[*VALUE_COLUMNS]].astype({"at": object, "sd": object})
+    return found.where(found.notna(), None)
+
+
+def _numbers(curve: Curve, levels: Iterable[float]) -> Iterator[tuple[str, float | None, float]]:
+    """Yield ``quantity``, ``at`` and value of all that a curve gives; NaN if it does not."""
+    for time in LADDER:
+        yield "psnr", float(time), psnr_after(curve, time)
+    seconds, psnr = curve[:, -1].tolist()
+    yield "psnr_end", None, psnr
+    yield "seconds_end", None, seconds
+    yield "gain", None, psnr - psnr_after(curve, seconds / 2)
+    for level in levels:
+        yield "seconds", level, seconds_until(curve, level)
+
+
+def _over_scenes(values: DataFrame) -> DataFrame:
+    """Average over scenes the numbers that are known for all of them."""
+    scenes = values.scene.nunique()
+    found = values.groupby(["label", "quantity", "at"], sort=False, dropna=False).agg(
+        mean=("mean", mean),
+        sd=("sd", lambda sds: math.hypot(*sds) / scenes),
+        n=("n", "min"),
+        scenes=("scene", "size"),
+    )
+    return found[found.scenes == scenes].reset_index()
 
 
 def psnr_levels(curves: Sequence[Curve]) -> list[float]:
@@ -131,77 +153,35 @@ def psnr_levels(curves: Sequence[Curve]) -> list[float]:
     return [float(level) for level in range(high, low - 1, -step)][::-1]
 
 
-def _of_seeds(
-    scene: str, device: str, label: str, curves: Sequence[Curve], levels: Iterable[float]
-) -> Iterator[CurveValue]:
-    wanted: list[tuple[str, float | None, list[float]]] = [
-        ("psnr", float(time), [psnr_after(curve, time) for curve in curves]) for time in LADDER
-    ]
-    ends = [(float(curve[0, -1]), float(curve[1, -1])) for curve in curves]
-    gains = [
-        psnr - psnr_after(curve, time / 2) for curve, (time, psnr) in zip(curves, ends, strict=True)
-    ]
-    wanted += [
-        ("psnr_end", None, [psnr for _, psnr in ends]),
-        ("seconds_end", None, [time for time, _ in ends]),
-        ("gain", None, gains),
-    ]
-    wanted += [("seconds", level, [seconds_until(c, level) for c in curves]) for level in levels]
-    for quantity, at, values in wanted:
-        if all(map(math.isfinite, values)):
-            sd = stdev(values) if len(values) > 1 else None
-            yield CurveValue(scene, device, label, quantity, at, mean(values), sd, len(values))
-
-
-def _over_scenes(single: Sequence[CurveValue], scenes: int) -> Iterator[CurveValue]:
-    """Average over scenes the numbers that are known for all of them."""
-    parts: dict[tuple[str, str, float | None], list[CurveValue]] = {}
-    for value in single:
-        key = value.label, value.quantity, value.at
-        parts.setdefault(key, []).append(value)
-    for (label, quantity, at), part in parts.items():
-        if len(part) == scenes:
-            sds = [value.sd for value in part if value.sd is not None]
-            sd = math.hypot(*sds) / scenes if len(sds) == scenes else None
-            value, n = mean(value.mean for value in part), min(r.n for r in part)
-            yield CurveValue(ALL_SCENES, part[0].device, label, quantity, at, value, sd, n)
-
-
-def time_tables(found: Sequence[CurveValue]) -> list[Table]:
+def time_tables(values: DataFrame) -> list[Table]:
     """Make tables for each device and scene: PSNR after times, and times until PSNR levels."""
+    ends = {
+        "psnr_end": "at the end",
+        "seconds_end": "training [s]",
+        "gain": "gain of the second half",
+    }
     made = []
-    for device, scene in dict.fromkeys((value.device, value.scene) for value in found):
-        part = [r for r in found if (r.device, r.scene) == (device, scene)]
-        place = f"on {device}"
-        title = f"{scene}: PSNR [dB] of the probe views after so much training {place}"
-        ends = {
-            "psnr_end": "at the end",
-            "seconds_end": "training [s]",
-            "gain": "gain of the second half",
-        }
+    for (device, scene), part in values.groupby(["device", "scene"], sort=False):
+        title = f"{scene}: PSNR [dB] of the probe views after so much training on {device}"
         made.append(_table(title, part, "psnr", ends))
-        title = f"{scene}: training time [s] until the probe views have a PSNR of, {place}"
+        title = f"{scene}: training time [s] until the probe views have a PSNR of, on {device}"
         made.append(_table(title, part, "seconds", {}))
     return made
 
 
-def _table(title: str, part: Sequence[CurveValue], quantity: str, more: dict[str, str]) -> Table:
+def _table(title: str, part: DataFrame, quantity: str, more: dict[str, str]) -> Table:
     """Put configurations in rows, places of a quantity and further quantities in columns."""
-    columns = {(quantity, r.at) for r in part if r.quantity == quantity}
-    ordered: list[tuple[str, float | None]] = sorted(columns, key=lambda column: column[1] or 0)
+    places = sorted({*part[part.quantity == quantity]["at"]})
     spell = in_time if quantity == "psnr" else "{:g} dB".format
-    heads = [("method", ""), *((spell(at or 0), "") for _, at in ordered)]
-    heads += [(text, "") for text in more.values()]
-    ordered += [(name, None) for name in more]
-    texts = {(r.label, (r.quantity, r.at)): _text(r) for r in part}
-    labels = dict.fromkeys(r.label for r in part)
-    rows = [[label, *(texts.get((label, column), "") for column in ordered)] for label in labels]
+    heads = [(text, "") for text in ("method", *map(spell, places), *more.values())]
+    columns = [*((quantity, at) for at in places), *((name, None) for name in more)]
+    texts = {}
+    for row in part.itertuples():
+        unit = "seconds" if row.quantity.startswith("seconds") else "psnr"
+        texts[row.label, (row.quantity, row.at)] = with_spread(unit, row.mean, row.sd)
+    labels = part.label.unique()
+    rows = [[label, *(texts.get((label, column), "") for column in columns)] for label in labels]
     return Table(heads, rows, title=title)
-
-
-def _text(value: CurveValue) -> str:
-    unit = "seconds" if value.quantity.startswith("seconds") else "psnr"
-    return with_spread(unit, value.mean, value.sd)
 
 
 def in_time(seconds: float) -> str:

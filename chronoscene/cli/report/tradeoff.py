@@ -14,7 +14,6 @@ from chronoscene.bench.plan.stop import parse_duration
 from chronoscene.bench.report.summary import COSTS, read_runs, summarise
 from chronoscene.bench.report.tables import COST_TITLES, footnotes, tables_text
 from chronoscene.bench.report.time_to_quality import (
-    CurveValue,
     curve_values,
     read_curve,
     time_tables,
@@ -129,7 +128,7 @@ def _notes(records: Sequence[RunRecord], failures: Sequence[Failure]) -> list[st
 
 
 def _text(
-    points: DataFrame, times: Sequence[CurveValue], notes: list[str], style: str, out: Path | None
+    points: DataFrame, times: DataFrame, notes: list[str], style: str, out: Path | None
 ) -> str:
     """Return everything but the figure, in one of the formats."""
     if style == "csv":
@@ -137,7 +136,7 @@ def _text(
     if style == "json":
         from pydantic import ConfigDict, TypeAdapter
 
-        fronts = points.to_dict("records")
+        fronts, times = points.to_dict("records"), times.to_dict("records")
         document: dict[str, Any] = {"fronts": fronts, "times": times, "notes": notes}
         adapter = TypeAdapter(dict[str, Any], config=ConfigDict(ser_json_inf_nan="strings"))
         return adapter.dump_json(document, indent=1).decode() + "\n"

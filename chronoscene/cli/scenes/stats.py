@@ -209,10 +209,8 @@ def _scenes(folder: Path, request: StatsRequest) -> list[Path]:
 
 
 def _lost(item: tuple[Path, str]) -> Unreadable:
-    path = str(item[0])
-    return Unreadable(
-        path, f"{path}: the process died; if memory ran out, run stats on this scene alone"
-    )
+    cause = "the process died; if memory ran out, run stats on this scene alone"
+    return Unreadable(str(item[0]), f"{item[0]}: {cause}")
 
 
 def _file_names(paths: Sequence[Path]) -> list[str]:

@@ -29,7 +29,7 @@ def values(found, quantity, scene="plaza"):
     """Label and place asked for, to mean, spread and number of seeds."""
     return {
         (r.label, r.at): (r.mean, r.sd, r.n)
-        for r in found
+        for r in found.itertuples()
         if (r.quantity, r.scene) == (quantity, scene)
     }
 
@@ -76,8 +76,8 @@ def test_devices_are_apart_and_scenes_averaged():
     runs = [record("a"), record("a", **quay), record("b"), record("a", seed=1, device="other")]
     found = curve_values(runs, [CURVE, BETTER, CURVE, CURVE])
     assert values(found, "psnr_end", ALL_SCENES) == {("A (joint, fast)", None): (24.0, None, 1)}
-    assert {r.device for r in found if r.scene == ALL_SCENES} == {runs[0].device}
-    assert all(r.n == 1 for r in found)
+    assert {*found[found.scene == ALL_SCENES].device} == {runs[0].device}
+    assert (found.n == 1).all()
     titles = [table.title for table in time_tables(found)]
     assert len(titles) == 8 and titles[-1].startswith("plaza: ") and titles[-1].endswith("other")
 
@@ -99,7 +99,7 @@ def test_levels_are_whole_and_few():
     assert psnr_levels([np.array([[1, 2], [19.5, 22.5]])]) == [20, 21, 22]
     levels = psnr_levels([np.array([[1, 2], [10.0, 40.0]])])
     assert len(levels) <= MAX_LEVELS and levels[-1] == 40 and levels[0] > 9
-    assert curve_values([record()], [None]) == []
+    assert curve_values([record()], [None]).empty
 
 
 def test_curves_of_runs_are_read(bench_here, tmp_path):
