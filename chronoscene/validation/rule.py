@@ -104,7 +104,7 @@ SOURCES["usable_cameras"] = "cameras"
 
 RETIRED = (
     *("CS109", "CS113", "CS114", "CS142", "CS214", "CS216", "CS226", "CS244", "CS326"),
-    *("CS511", "CS517", "CS519", "CS521", "CS524"),
+    *("CS511", "CS517", "CS519", "CS521", "CS524", "CS707"),
 )
 """Codes of rules that are gone; they are never reused."""
 

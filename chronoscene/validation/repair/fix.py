@@ -202,39 +202,15 @@ class _Fix:
         return (images / name).resolve().is_relative_to(images)
 
     def _copy_rest(self) -> None:
-        """Copy everything else unchanged, except links that lead out of the scene."""
-        top = self._scene.root.resolve()
-        left_out = []
-        for path, place in _files(top):
-            if place in self._written:
-                continue
-            if not path.resolve().is_relative_to(top):
-                left_out.append(place)
-            elif path.is_file():
-                _link(path, self._out / place)
-        kept = self._behind_links(top)
-        left_out = [p for p in left_out if not any(k == p or k.startswith(f"{p}/") for k in kept)]
-        if left_out:
-            links = counted(len(left_out), "link")
-            what = f"{links} leading out of the scene left out: {shown(left_out)}"
-            self._repairs.append(Repair("", what))
+        """Copy everything else unchanged, except links that lead out of the scene.
 
-    def _behind_links(self, top: Path) -> list[str]:
-        """Add parts of the scene that are still missing because they are behind links; lists them.
-
-        Images elsewhere are linked again, so that only the model is copied from there.
+        Images and masks elsewhere are linked again; of other parts, the model and the texts are
+        copied from there.
         """
-        names = [f"images/{name}" for name in self._scene.present]
-        names += [mask_place(name) for name in self._scene.present]
-        below = f"{self._scene.model_place}/" if self._scene.model_place else ""
-        stems = (*MODEL_FILES, "rigs", "frames")
-        model = [f"{below}{stem}{form}" for stem in stems for form in FORMS]
-        kept, linked = [], 0
-        for place in (*names, *model, SPLIT, TEST, PERIODS, WORLD):
+        top = self._scene.root.resolve()
+        linked, parts = 0, self._parts()
+        for place in parts:
             source, target = self._scene.root / place, self._out / place
-            if place in self._written or os.path.lexists(target) or not source.is_file():
-                continue
-            kept.append(place)
             if source.resolve().is_relative_to(top) or not place.startswith(("images/", MASKS)):
                 _link(source, target)
             else:
@@ -243,7 +219,34 @@ class _Fix:
                 linked += 1
         if linked:
             self._repairs.append(Repair("", f"{counted(linked, 'image')} linked from elsewhere"))
-        return kept
+        left_out = []
+        for path, place in _files(top):
+            if place in self._written:
+                continue
+            if path.resolve().is_relative_to(top):
+                if path.is_file():
+                    _link(path, self._out / place)
+            elif not any(part == place or part.startswith(f"{place}/") for part in parts):
+                left_out.append(place)
+        if left_out:
+            links = counted(len(left_out), "link")
+            what = f"{links} leading out of the scene left out: {shown(left_out)}"
+            self._repairs.append(Repair("", what))
+
+    def _parts(self) -> list[str]:
+        """List the files of the scene that are not written yet, also those behind links."""
+        names = [f"images/{name}" for name in self._scene.present]
+        names += [mask_place(name) for name in self._scene.present]
+        below = f"{self._scene.model_place}/" if self._scene.model_place else ""
+        stems = (*MODEL_FILES, "rigs", "frames")
+        model = [f"{below}{stem}{form}" for stem in stems for form in FORMS]
+        return [
+            place
+            for place in (*names, *model, SPLIT, TEST, PERIODS, WORLD)
+            if place not in self._written
+            and not os.path.lexists(self._out / place)
+            and (self._scene.root / place).is_file()
+        ]
 
     def _write(self, place: str, text: str) -> bool:
         """Write a text file, unless it has names that are not text, which have their own rule."""

@@ -80,10 +80,7 @@ def _rule(code: str, findings: list[Finding]) -> list[str]:
 def _fold(findings: Iterable[Finding]) -> list[str]:
     """One line for all findings that differ only in their place."""
     places = grouped((f"expected {f.expected}, found {f.found}", f.place) for f in findings)
-    lines = []
-    for text, where in places.items():
-        lines.append(f"{_places(where)}: {text}")
-    return lines
+    return [f"{_places(where)}: {text}" for text, where in places.items()]
 
 
 def _places(where: Sequence[str]) -> str:

@@ -40,13 +40,6 @@ MAX_WRONG = 0.5  # Share of the photos of a period beyond which the whole period
 MIN_OBSERVATIONS = 30  # Observations of an image from which their correlation is meaningful
 LUMA = (0.299, 0.587, 0.114)  # Weights of red, green and blue in brightness (ITU-R BT.601)
 
-TURNS = {
-    "rotated by 180 degrees": np.s_[::-1, ::-1],
-    "mirrored": np.s_[:, ::-1],
-    "upside down": np.s_[::-1, :],
-}
-"""Description to the slices that make a turned photo right."""
-
 
 @rule.warning(
     "CS231",
@@ -111,9 +104,8 @@ def _whole_periods(scene: RawScene, looked_at: list[str], wrong: set[str]) -> di
 
 def _what_fits(sight: Sight, name: str, suspects: Greys) -> tuple[str, tuple[str, ...]]:
     """Describe the photo that would fit instead; return its name, too, if it is another one."""
-    for words, turn in TURNS.items():
-        if sight.correlation(suspects[name][turn]) >= USUAL:
-            return f"; it fits {words}", ()
+    if sight.correlation(suspects[name][::-1, ::-1]) >= USUAL:
+        return "; it fits rotated by 180 degrees", ()
     others = {n: sight.correlation(grey) for n, grey in suspects.items() if n != name}
     best = max(others, key=lambda n: others[n], default=None)
     if best is not None and others[best] >= USUAL:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from chronoscene.arrays import Ints, Mask
 from chronoscene.errors import ChronoSceneError
@@ -83,11 +84,8 @@ def common_points(seen: Mask) -> Ints:
 
 def connected(common: Ints, minimum: int) -> list[Ints]:
     """Groups of periods linked by chains of at least ``minimum`` common points, as indices."""
-    reach = (common >= minimum) | np.eye(len(common), dtype=bool)
-    for _ in range(len(common).bit_length()):  # doubles the steps each time
-        reach = (reach.astype(np.float32) @ reach.astype(np.float32)) > 0
-    first = [int(np.flatnonzero(row)[0]) for row in reach]  # of its group
-    return [np.flatnonzero(reach[period]) for period in sorted(set(first))]
+    count, group = connected_components(common >= minimum, directed=False)
+    return [np.flatnonzero(group == i) for i in range(count)]
 
 
 @rule.warning(

@@ -10,7 +10,6 @@ from collections.abc import Hashable, Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import shown
@@ -181,12 +180,15 @@ def twins(
     ``places`` [N, 3] are camera centres, in one place up to a distance of ``near``; ``rotations``
     are [N, 3, 3]; ``periods`` [N] are negative for none; ``test`` [N] is true for test images.
     """
-    tree = cKDTree(places)
+    order = np.argsort(places[:, 0], kind="stable")
+    x = places[order, 0]
     for i in np.flatnonzero(test & (periods >= 0)).tolist():
-        others = np.sort(np.array(tree.query_ball_point(places[i], near), np.int64))
+        begin = np.searchsorted(x, places[i, 0] - near)
+        others = order[begin : np.searchsorted(x, places[i, 0] + near, "right")]
         others = others[(periods[others] == periods[i]) & ~test[others]]
+        close = np.linalg.norm(places[others] - places[i], axis=1) <= near
         turned = np.linalg.norm(rotations[others] - rotations[i], axis=(1, 2))
-        if len(alike := others[turned <= SAME_DIRECTION]):
+        if len(alike := others[close & (turned <= SAME_DIRECTION)]):
             yield i, int(alike[0])
 
 

@@ -9,10 +9,6 @@ import re
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
-import numpy as np
-from numpy.typing import NDArray
-
-from chronoscene.colmap.raw_model import RawPoints
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
@@ -26,16 +22,6 @@ from chronoscene.validation.rules.cs3_split import test_elsewhere
 
 GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "I;16N")
 """Pillow's modes without colour."""
-
-VOXEL, NEAR = 0.001, 0.2
-"""World units; constants of the released code, and of 3D Gaussian splatting."""
-
-MIN_LOST = 0.1  # Share of points or observations worth reporting
-SAMPLE = 10_000  # Points from which the extent of the scene is estimated
-
-CROWDED = 10
-"""Points lie on surfaces: on a square of side a, n points are about a / sqrt(n) apart. If that is
-this many voxels, no two of them share one."""
 
 OFF_CENTRE = 0.5  # Pixels; half a pixel is a difference of convention, not of the lens
 
@@ -154,37 +140,6 @@ def official_default_split(
     without = f", none in period {', '.join(map(str, empty))}" if empty else ""
     found = f"{counted(len(theirs), 'other test image')}{without}"
     yield Hit(TEST, "the same split in the official code", found)
-
-
-@rule.info(
-    "CS707",
-    bad="a city in units of 100 m",
-    remedy="nothing to do here; for the released code, scale the scene up, or set the voxel size",
-)
-def official_units(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
-    """The units of the scene are too small for the released code, whose voxels have an edge of
-    0.001 world units; the code of 3D Gaussian splatting drops everything nearer to the camera than
-    0.2."""
-    xyz = points.xyz[np.isfinite(points.xyz).all(axis=1)]
-    if _is_small(xyz):
-        cells = len(np.unique(np.round(xyz / VOXEL), axis=0))
-        if cells < (1 - MIN_LOST) * len(xyz):
-            found = f"{cells} for {len(xyz)} points"
-            yield Hit(scene.model_file("points3D"), f"a voxel of {VOXEL:g} for each point", found)
-    depth = np.concatenate([np.zeros(0), *(s.depth for s in scene.reprojections or ())])
-    near = int(np.count_nonzero((depth > 0) & (depth < NEAR)))
-    if near > MIN_LOST * len(depth):
-        found = f"{near} of {len(depth)} nearer"
-        expected = f"observations at least {NEAR:g} world units from the camera"
-        yield Hit(scene.model_file("points3D"), expected, found, count=near)
-
-
-def _is_small(xyz: NDArray[np.float64]) -> bool:
-    """Return True if this many points could share voxels: avoids sorting large scenes."""
-    if len(xyz) < 2:
-        return False
-    low, high = np.percentile(xyz[:: len(xyz) // SAMPLE + 1], [5, 95], axis=0)
-    return bool(np.max(high - low) < VOXEL * len(xyz) ** 0.5 * CROWDED)
 
 
 def _cut(name: str) -> str:

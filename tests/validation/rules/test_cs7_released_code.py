@@ -87,23 +87,3 @@ def test_official_default_split(scene):
     scene.path(TEST).unlink()
     # Ours: a000, a008, b000, b008. Theirs: the images 0, 8 and 16 of all.
     scene.expect("CS706", place=TEST, found="3 other test images", also={"CS321"})
-
-
-def scale_scene(scene, scale):
-    """Poses and points in other units."""
-    scene.change_poses(lambda r, t: (r, t * scale), range(18))
-    lines = [line.split() for line in scene.lines("sparse/0/points3D.txt")]
-    for words in lines:
-        words[1:4] = [f"{float(x) * scale:.17g}" for x in words[1:4]]
-    scene.write("sparse/0/points3D.txt", [" ".join(words) for words in lines])
-
-
-def test_official_units_near(scene):
-    scale_scene(scene, 0.02)
-    found = "720 of 720 nearer"
-    scene.expect("CS707", place="sparse/0/points3D.txt", found=found)
-
-
-def test_official_units_voxels(scene):
-    scale_scene(scene, 0.001)
-    scene.expect("CS707", place="sparse/0/points3D.txt", found="for 40 points", times=2)
