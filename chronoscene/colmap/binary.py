@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Ints
 from chronoscene.colmap.raw_model import (
     IDENTITY,
     Pose,
@@ -268,9 +269,7 @@ def _point_offsets(reader: _Reader) -> list[int]:
     return offsets
 
 
-def _gather_points(
-    data: bytes, offsets: NDArray[np.int64], lengths: NDArray[np.int64]
-) -> RawPoints:
+def _gather_points(data: bytes, offsets: Ints, lengths: Ints) -> RawPoints:
     """Copy the records at ``offsets`` out of the file, in the order of the point ids."""
     heads = _at_every_byte(data, POINT_HEAD)[offsets]
     if (heads["id"][1:] < heads["id"][:-1]).any():

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.colmap import binary, text
 from chronoscene.colmap.raw_model import (
     MODEL_FILES,
@@ -44,7 +44,7 @@ class PosedImage:
     image_id: int
     name: str
     camera: Camera
-    cam_from_world: NDArray[np.float64]
+    cam_from_world: Array
     """[4, 4]"""
 
 
@@ -270,7 +270,7 @@ def _posed_images(folder: Path, model: pycolmap.Reconstruction) -> tuple[PosedIm
     return tuple(images[name] for name in sorted(images))
 
 
-def _pose(rigid: pycolmap.Rigid3d) -> NDArray[np.float64]:
+def _pose(rigid: pycolmap.Rigid3d) -> Array:
     """Convert a pose to a matrix, NaN for quaternions without a direction. [4, 4]
 
     Text with few digits has quaternions that are not quite unit; the matrices that pycolmap makes

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from chronoscene.arrays import Array, Ints
 from chronoscene.scene import Camera
 from chronoscene.scene.scene import PointTable
 
@@ -42,21 +40,21 @@ FoundModel = tuple[str, str]
 class RawImages:
     """Registered images in the order of the file (I images, K keypoints)."""
 
-    ids: NDArray[np.int64]
+    ids: Ints
     """[I]"""
     names: tuple[str, ...]
     """Bytes that are not UTF-8 as lone surrogates, as Python has them in file names."""
-    quaternions: NDArray[np.float64]
+    quaternions: Array
     """wxyz, as stored. [I, 4]"""
-    translations: NDArray[np.float64]
+    translations: Array
     """[I, 3]"""
-    camera_ids: NDArray[np.int64]
+    camera_ids: Ints
     """[I]"""
-    keypoint_start: NDArray[np.int64]
+    keypoint_start: Ints
     """Keypoints of image i are ``keypoint_start[i]:keypoint_start[i + 1]``. [I + 1]"""
-    keypoint_xy: NDArray[np.float64]
+    keypoint_xy: Array
     """Pixels. [K, 2]"""
-    keypoint_point: NDArray[np.int64]
+    keypoint_point: Ints
     """Point id, negative for none. [K]"""
 
     def __len__(self) -> int:
@@ -67,9 +65,9 @@ class RawImages:
 class RawPoints(PointTable):
     """Sparse points sorted by id, with tracks over what the model calls images and keypoints."""
 
-    track_image: NDArray[np.int64]
+    track_image: Ints
     """Image id. [M]"""
-    track_keypoint: NDArray[np.int64]
+    track_keypoint: Ints
     """Index among the keypoints of the image. [M]"""
 
 

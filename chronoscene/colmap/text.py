@@ -15,8 +15,8 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints
 from chronoscene.colmap.raw_model import (
     CAMERA,
     IDENTITY,
@@ -214,7 +214,7 @@ def _numbers(
     expected: str,
     fits: Callable[[int], bool],
     damages: list[Damage],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Array, Ints]:
     """Parse all numbers of some lines, one after the other, and count those of each line.
 
     Lines that are not numbers, or of a number that does not fit, are added to ``damages``.
@@ -234,7 +234,7 @@ def _numbers(
     return np.concatenate(blocks), np.concatenate(lengths)
 
 
-def _integers(values: NDArray[np.float64]) -> NDArray[np.int64]:
+def _integers(values: Array) -> Ints:
     """Cast without a warning; values that are not finite become numbers that are no valid ids."""
     with np.errstate(invalid="ignore"):
         return values.astype(np.int64)

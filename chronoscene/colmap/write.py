@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints
 from chronoscene.colmap.binary import KEYPOINT, POINT_HEAD
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.scene.cameras import MODEL_NAMES, Camera
@@ -57,12 +57,12 @@ def write_without_observations(source: Path, images: RawImages, folder: Path) ->
 
 
 def posed_images(
-    ids: NDArray[np.int64],
+    ids: Ints,
     names: Sequence[str],
-    poses: NDArray[np.float64],
-    camera_ids: NDArray[np.int64],
-    observations: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
-) -> tuple[RawImages, NDArray[np.int64]]:
+    poses: Array,
+    camera_ids: Ints,
+    observations: tuple[Ints, Ints, Array],
+) -> tuple[RawImages, Ints]:
     """Make images whose keypoints are the given observations, in their order.
 
     Args:

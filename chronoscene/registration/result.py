@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference
 from chronoscene.scene import Camera
 
@@ -28,11 +29,11 @@ class CrossMatches:
     image_a: int
     """Index into `Registered.names`; its period is the earlier one."""
     image_b: int
-    xy_a: NDArray[np.float64]
+    xy_a: Array
     """Pixels in ``cameras[image_a]``, with its distortion. [M, 2]"""
-    xy_b: NDArray[np.float64]
+    xy_b: Array
     """[M, 2]"""
-    track: NDArray[np.int64]
+    track: Ints
     """Held-out track of each match: index of a track in `HeldOutTracks`. [M]"""
 
 
@@ -44,11 +45,11 @@ class HeldOutTracks:
     can be triangulated in one and projected into another.
     """
 
-    start: NDArray[np.int64]
+    start: Ints
     """Observations of track i are ``start[i]:start[i + 1]``. [K + 1]"""
-    image: NDArray[np.int64]
+    image: Ints
     """Index into `Registered.names`. [O]"""
-    xy: NDArray[np.float64]
+    xy: Array
     """[O, 2]"""
 
     @classmethod
@@ -65,30 +66,30 @@ class Registered:
 
     names: tuple[str, ...]
     """Registered images, sorted, unique: paths below the folder of the prepared photos."""
-    periods: NDArray[np.int64]
+    periods: Ints
     """Period of each image. [N]"""
-    cam_from_world: NDArray[np.float64]
+    cam_from_world: Array
     """[N, 4, 4]"""
     cameras: tuple[Camera, ...]
     """Camera of each image, with its distortion. [N]"""
-    points: NDArray[np.float64]
+    points: Array
     """[P, 3]"""
     colors: NDArray[np.uint8]
     """[P, 3]"""
-    track_start: NDArray[np.int64]
+    track_start: Ints
     """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
-    track_image: NDArray[np.int64]
+    track_image: Ints
     """Index into ``names``. [O]"""
-    track_xy: NDArray[np.float64]
+    track_xy: Array
     """Pixels of the observations. [O, 2]"""
     unregistered: Mapping[str, str]
     """Name of each image that has no pose, and why. A refused photo is listed by its path."""
     unregistered_periods: Mapping[str, int]
     """Period of each of them."""
     route: Route
-    gps_enu: NDArray[np.float64]
+    gps_enu: Array
     """GPS position of each photo in the frame of the model, plausible or not; else NaN. [N, 3]"""
-    gps_used: NDArray[np.bool_]
+    gps_used: Mask
     """True if the position took part in the estimation. [N]"""
     georeference: Georeference | None
     """None if the frame is arbitrary, and with it its scale."""

@@ -54,23 +54,15 @@ class Stages:
     log: list[dict[str, Any]] = field(default_factory=list)
     """A record of each stage: name, seconds, remarks, whether it was done in an earlier run."""
 
-    def run(
-        self,
-        name: str,
-        inputs: Any,
-        action: Callable[[], tuple[Any, Sequence[str]]],
-        *,
-        chained: bool = True,
-    ) -> Any:
+    def run(self, name: str, inputs: Any, action: Callable[[], tuple[Any, Sequence[str]]]) -> Any:
         """Run a stage unless it was done with the same inputs before; return its result.
 
         Args:
             name: Of the stage, and of its record.
             inputs: All that the result depends on besides the stages before, as JSON holds it.
             action: Gives the result, as JSON holds it, and remarks for the log.
-            chained: Whether the stages before matter.
         """
-        key = fingerprint(VERSION, name, self.previous if chained else "", inputs)
+        key = fingerprint(VERSION, name, self.previous, inputs)
         path = self.folder / f"stage-{name}.json"
         record = read_record(path)
         if record is None or record.get("key") != key:
@@ -90,7 +82,7 @@ class Stages:
             resumed = True
         entry = {k: record[k] for k in ("stage", "seconds", "remarks")}
         self.log.append(entry | {"from_an_earlier_run": resumed})
-        self.previous = key if chained else self.previous
+        self.previous = key
         return record["result"]
 
     def remark(self, stage: str, *remarks: str) -> None:

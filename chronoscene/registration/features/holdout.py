@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import replacing
@@ -33,26 +33,23 @@ MIN_LEFT = 16  # A pair of images keeps at least this many matches: sparse pairs
 class Tracks:
     """Keypoints of all images joined by matches, flat."""
 
-    image: NDArray[np.int64]
+    image: Ints
     """Image id of each keypoint that has a match. [K]"""
-    keypoint: NDArray[np.int64]
+    keypoint: Ints
     """Its index in the image. [K]"""
-    track: NDArray[np.int64]
+    track: Ints
     """[K]"""
     offset: Mapping[int, int]
     """Index of keypoint 0 of an image in the numbering that `node_track` has."""
-    node_track: NDArray[np.int64]
+    node_track: Ints
     """Track of every keypoint of every image; -1 without matches."""
 
-    def of(self, image: int, keypoints: NDArray[np.int64]) -> NDArray[np.int64]:
+    def of(self, image: int, keypoints: Ints) -> Ints:
         """Track of keypoints of an image."""
         return self.node_track[self.offset[image] + keypoints]
 
 
-def build_tracks(
-    matches: Mapping[tuple[int, int], NDArray[np.int64]],
-    keypoints: Mapping[int, NDArray[np.float64]],
-) -> Tracks:
+def build_tracks(matches: Mapping[tuple[int, int], Ints], keypoints: Mapping[int, Array]) -> Tracks:
     """Join matches to tracks: the connected components of keypoints.
 
     SIFT gives several keypoints at one pixel where it finds several orientations. They count as
@@ -83,7 +80,7 @@ def build_tracks(
     return Tracks(image, keypoint, node_track[used], offset, node_track[alias])
 
 
-def first_at_place(xy: NDArray[np.float64]) -> NDArray[np.int64]:
+def first_at_place(xy: Array) -> Ints:
     """Index of the first keypoint at the position of each keypoint. [K, 2] -> [K]"""
     if not len(xy):
         return np.zeros(0, np.int64)
@@ -91,7 +88,7 @@ def first_at_place(xy: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(first[inverse.ravel()], np.int64)
 
 
-def eligible_tracks(tracks: Tracks, period_of: Mapping[int, int]) -> NDArray[np.int64]:
+def eligible_tracks(tracks: Tracks, period_of: Mapping[int, int]) -> Ints:
     """Tracks of two periods or more, without two keypoints in one image, which are mismatched."""
     images, slot = np.unique(tracks.image, return_inverse=True)
     period = np.array([period_of[i] for i in images.tolist()], np.int64)
@@ -136,7 +133,7 @@ def hold_out(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
 
 def _cross_counts(
-    matches: Mapping[tuple[int, int], NDArray[np.int64]], period_of: Mapping[int, int]
+    matches: Mapping[tuple[int, int], Ints], period_of: Mapping[int, int]
 ) -> dict[tuple[int, int], tuple[int, int]]:
     """Count pairs of images and their matches between every two periods."""
     counts: dict[tuple[int, int], tuple[int, int]] = {}
@@ -148,9 +145,7 @@ def _cross_counts(
     return counts
 
 
-def _filtered_copy(
-    source: Path, target: Path, tracks: Tracks, chosen: NDArray[np.int64]
-) -> NDArray[np.bool_]:
+def _filtered_copy(source: Path, target: Path, tracks: Tracks, chosen: Ints) -> Mask:
     """Copy a database without the matches of some tracks.
 
     Returns:
@@ -177,7 +172,7 @@ def _filtered_copy(
     return held
 
 
-def _first_column(geometry: pycolmap.TwoViewGeometry) -> NDArray[np.int64]:
+def _first_column(geometry: pycolmap.TwoViewGeometry) -> Ints:
     return np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)[:, 0]
 
 
@@ -201,9 +196,9 @@ def _remove_journals(database: Path) -> None:
 def _write_held_out(
     path: Path,
     tracks: Tracks,
-    chosen: NDArray[np.int64],
-    held: NDArray[np.bool_],
-    points: Mapping[int, NDArray[np.float64]],
+    chosen: Ints,
+    held: Mask,
+    points: Mapping[int, Array],
     names: Mapping[int, str],
 ) -> None:
     """Write the observations of held-out tracks: track, image and pixels."""

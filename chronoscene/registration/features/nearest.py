@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask
 from chronoscene.kernels.compilation import kernel
 from chronoscene.kernels.matmul import ROW_TILE, pair_product
 from chronoscene.kernels.vectors import LANES
@@ -81,9 +82,7 @@ def _squares(values: NDArray[np.uint8]) -> Integers:
     return np.asarray(np.square(values, dtype=np.int32).sum(axis=1, dtype=np.int32))
 
 
-def _nearest(
-    queries: NDArray[np.uint8], searched: Descriptors
-) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+def _nearest(queries: NDArray[np.uint8], searched: Descriptors) -> tuple[NDArray[np.int32], Mask]:
     """Index of the nearest descriptor, and True where it passes both tests. [Q], [Q]"""
     padded = np.zeros((-(-len(queries) // ROW_TILE) * ROW_TILE, 2 * PAIRS), np.int16)
     padded[: len(queries)] = queries

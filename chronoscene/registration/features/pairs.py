@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import quiet, write_pairs
@@ -67,7 +68,7 @@ def choose_pairs(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]
     return {"pairs": len(ordered), "across_periods": across, "kinds": counts}
 
 
-def _positions(images: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
+def _positions(images: Sequence[Mapping[str, Any]]) -> Array:
     """Positions in metres, NaN where unknown. [N, 3]"""
     nowhere = [np.nan] * 3
     return np.array([image["enu"] or nowhere for image in images], np.float64).reshape(-1, 3)
@@ -77,7 +78,7 @@ def _ordered(pairs: Iterable[Pair]) -> set[Pair]:
     return {(min(i, j), max(i, j)) for i, j in pairs if i != j}
 
 
-def spatial_pairs(enu: NDArray[np.float64], periods: NDArray[np.int64]) -> set[Pair]:
+def spatial_pairs(enu: Array, periods: Ints) -> set[Pair]:
     """Pair images with their nearest in every period, in plan view: GPS heights are poor."""
     from scipy.spatial import cKDTree  # takes longer to load than few images to pair
 
@@ -94,7 +95,7 @@ def spatial_pairs(enu: NDArray[np.float64], periods: NDArray[np.int64]) -> set[P
     return _ordered(found)
 
 
-def sequential_pairs(images: Sequence[Mapping[str, Any]], periods: NDArray[np.int64]) -> set[Pair]:
+def sequential_pairs(images: Sequence[Mapping[str, Any]], periods: Ints) -> set[Pair]:
     """Pair images with those taken next in their period; by name where times are unknown."""
     found: list[Pair] = []
     for period in np.unique(periods).tolist():
@@ -106,7 +107,7 @@ def sequential_pairs(images: Sequence[Mapping[str, Any]], periods: NDArray[np.in
     return _ordered(found)
 
 
-def similar_pairs(descriptors: NDArray[np.float32], periods: NDArray[np.int64]) -> set[Pair]:
+def similar_pairs(descriptors: NDArray[np.float32], periods: Ints) -> set[Pair]:
     """Pair images with the most similar ones of every period, by unit vectors [N, D]."""
     found: list[Pair] = []
     similarity = descriptors @ descriptors.T
@@ -158,7 +159,7 @@ def visual_words(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return words
 
 
-def assign(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
+def assign(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> Ints:
     """Nearest word of each descriptor. [K]"""
     scores = descriptors @ words.T - 0.5 * (words**2).sum(axis=1)
     return np.asarray(scores.argmax(axis=1), np.int64)

@@ -45,9 +45,6 @@ class Captures:
     """Path below the root, period, and reason of each photo that cannot be used."""
     remarks: tuple[str, ...]
 
-    def of_period(self, period: int) -> tuple[Capture, ...]:
-        return tuple(c for c in self.images if c.period == period)
-
 
 @dataclass(frozen=True, slots=True)
 class _Listed:

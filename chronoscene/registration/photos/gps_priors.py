@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Mask
 from chronoscene.geodesy import Georeference, HeightKind, median_longitude
 from chronoscene.registration.photos.photo import Capture
 
@@ -27,11 +27,11 @@ class Positions:
 
     georeference: Georeference | None
     """None unless at least three photos have different positions."""
-    enu: NDArray[np.float64]
+    enu: Array
     """NaN where a photo has none. [N, 3]"""
-    sigma: NDArray[np.float64]
+    sigma: Array
     """Standard deviation, metres, NaN where there is none. [N, 3]"""
-    plausible: NDArray[np.bool_]
+    plausible: Mask
     """Neither missing nor a gross error. [N]"""
     remarks: tuple[str, ...]
     """For the log."""
@@ -80,14 +80,12 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     return Positions(frame, enu, sigma, plausible, tuple(remarks))
 
 
-def _stated(captures: Sequence[Capture], name: str) -> NDArray[np.float64]:
+def _stated(captures: Sequence[Capture], name: str) -> Array:
     """Collect a field of the GPS of each photo; NaN where there is none. [N]"""
     return np.array([getattr(c.gps, name, None) for c in captures], np.float64)
 
 
-def _heights(
-    captures: Sequence[Capture], has: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], HeightKind, list[str]]:
+def _heights(captures: Sequence[Capture], has: Mask) -> tuple[Array, HeightKind, list[str]]:
     """Choose one kind of height for all photos: mixing kinds would tilt or distort the frame."""
     stated, relative = (_stated(captures, name) for name in ("altitude", "relative_altitude"))
     if np.isfinite(stated[has]).all():
@@ -102,9 +100,7 @@ def _heights(
     return np.zeros(len(captures)), "none", ["most photos state no height: 0 is used for all"]
 
 
-def _plausible(
-    captures: Sequence[Capture], enu: NDArray[np.float64], has: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], list[str]]:
+def _plausible(captures: Sequence[Capture], enu: Array, has: Mask) -> tuple[Mask, list[str]]:
     """Mask of the positions without gross errors, and remarks on the others."""
     distance = np.linalg.norm(enu[:, :2] - np.median(enu[has][:, :2], axis=0), axis=1)
     limit = max(GROSS_METRES, GROSS_FACTOR * float(np.median(distance[has])))
@@ -116,7 +112,7 @@ def _plausible(
     return has & ~wild, remarks
 
 
-def _sigma(capture: Capture, kind: HeightKind) -> NDArray[np.float64]:
+def _sigma(capture: Capture, kind: HeightKind) -> Array:
     """Standard deviations of a position east, north and up, in metres."""
     if capture.gps is None:
         return np.full(3, np.nan)

@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.arrays import Array, Ints
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, place, project
 from chronoscene.scene.similarity import Sim3, fit_robustly
 
@@ -37,7 +36,7 @@ class Transfers:
     """[O, 3]"""
     covariance: Array
     """Covariance of the points, for observations of one pixel. [O, 3, 3]"""
-    backward: NDArray[np.bool_]
+    backward: Mask
     """True if the point was placed by the later of the two periods. [O]"""
 
     def __len__(self) -> int:
@@ -243,12 +242,16 @@ def _describe(
     steps = rng.multivariate_normal(np.zeros(7), covariance, DRAWS, method="eigh")
     drawn = [_compose(step, similarity, middle) for step in steps]
     noise_only = [_compose(step, Sim3.identity(), middle) for step in steps]
+
+    def displacement(similarity: Sim3) -> float:
+        return float(np.median(np.linalg.norm(similarity.apply(centres) - centres, axis=1)))
+
     agreeing = (residual**2).sum(axis=1) < 9 * noise**2 * variance
     return Misalignment(
         tracks=len(np.unique(moved.rays.track[agreeing])),
         similarity=similarity,
         rotation=_interval(lambda m: rotation_angle(m.rotation), similarity, drawn, noise_only),
-        shift=_interval(lambda m: _displacement(m, centres), similarity, drawn, noise_only),
+        shift=_interval(displacement, similarity, drawn, noise_only),
     )
 
 
@@ -277,10 +280,6 @@ def _interval(
     high = float(np.percentile([size(m) for m in drawn], 97.5))
     chance = float(np.percentile([size(m) for m in noise], 95))
     return Interval(value, low=max(0.0, value - chance), high=max(value, high))
-
-
-def _displacement(similarity: Sim3, centres: Array) -> float:
-    return float(np.median(np.linalg.norm(similarity.apply(centres) - centres, axis=1)))
 
 
 def rotation_angle(rotation: Array) -> float:

@@ -187,7 +187,7 @@ def place(rays: TrackRays) -> PlacedPoints:
 
     First the point nearest to all rays, then three Gauss-Newton steps on the residuals in pixels.
     """
-    first = _first_of_groups(rays.track)
+    first = np.flatnonzero(np.diff(rays.track, prepend=-1))
     count = np.diff(np.append(first, len(rays)))
     several = np.repeat(count >= 2, count)
     rays, first, count = rays.where(several), first[count >= 2], count[count >= 2]
@@ -223,13 +223,6 @@ def _normal_equations(residual: Array, jacobian: Array, first: Ints) -> tuple[Ar
     gradient = np.add.reduceat(np.einsum("nki,nk->ni", jacobian, residual), first)
     size = np.trace(normal, axis1=1, axis2=2)
     return normal + (1e-9 * size + 1e-30)[:, None, None] * np.eye(3), gradient
-
-
-def _first_of_groups(track: Ints) -> Ints:
-    """Index of the first entry of each run of equal values."""
-    if not len(track):
-        return np.zeros(0, np.int64)
-    return np.flatnonzero(np.concatenate([[True], track[1:] != track[:-1]]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -239,16 +239,12 @@ def judge(certificate: Certificate) -> Verdict:
         objections += mine if linked else []
     good = _bounds(certificate, [k for k, level in pairs.items() if level == "pass"])
     if all(good[k] <= 1 or level == "pass" for k, level in pairs.items()):
-        objections = [f for f in objections if not _is_lack(f)]
+        # Chains of good pairs that link all periods supply what single pairs lack.
+        objections = [o for o in objections if o.level == "fail" or o.check not in LACKING]
     objections += _links(certificate, pairs, good)
     level = _worst(f.level for f in objections)
     objections.sort(key=lambda f: -LEVELS.index(f.level))
     return Verdict(level, _words(certificate, level, objections), tuple(objections), pairs)
-
-
-def _is_lack(objection: Objection) -> bool:
-    """Return True if chains of good pairs that link all periods outweigh an objection."""
-    return objection.level == "doubtful" and objection.check in LACKING
 
 
 def _worst(levels: Iterator[Level]) -> Level:

@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.scene.similarity import Sim3, Similarity, fit, fit_samples
 
 TRIALS = 1_000
@@ -36,25 +36,25 @@ QUANTILE = 0.02  # Points outside of this quantile and its mirror image do not s
 class PointPairs:
     """The same places in two models: M pairs, each with the observation that joined them."""
 
-    source: NDArray[np.float64]
+    source: Array
     """Points of the model that is to be moved. [M, 3]"""
-    target: NDArray[np.float64]
+    target: Array
     """[M, 3]"""
-    source_pose: NDArray[np.float64]
+    source_pose: Array
     """``cam_from_world`` of the image that sees the source point, in its own model. [M, 4, 4]"""
-    target_pose: NDArray[np.float64]
+    target_pose: Array
     """[M, 4, 4]"""
-    source_ray: NDArray[np.float64]
+    source_ray: Array
     """Observation of the source point, at depth 1 without distortion. [M, 2]"""
-    target_ray: NDArray[np.float64]
-    source_focal: NDArray[np.float64]
+    target_ray: Array
+    source_focal: Array
     """Pixels. [M]"""
-    target_focal: NDArray[np.float64]
+    target_focal: Array
 
     def __len__(self) -> int:
         return len(self.source)
 
-    def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PointPairs:
+    def select(self, rows: Ints | Mask) -> PointPairs:
         return PointPairs(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
@@ -63,7 +63,7 @@ class Alignment:
     """Alignment of one model to another."""
 
     target_from_source: Sim3
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     """[M]"""
     cells: int
     """Places in which there are inliers."""
@@ -76,11 +76,11 @@ class Alignment:
         return int(self.inliers.sum()) >= MIN_INLIERS and self.cells >= MIN_CELLS
 
 
-def align_by_points(pairs: PointPairs, *, seed: int = 0) -> Alignment | None:
+def align_by_points(pairs: PointPairs) -> Alignment | None:
     """Similarity on which most places agree; None if there is nothing to agree on."""
     if len(pairs) < 3:
         return None
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     cell = cells(pairs.target)
     members, weights = cell_members(cell), cell_weights(cell)
     judges = np.arange(len(pairs))
@@ -100,7 +100,7 @@ def align_by_points(pairs: PointPairs, *, seed: int = 0) -> Alignment | None:
     return None if best is None else _polish(pairs, best.to_sim3(), cell)
 
 
-def _polish(pairs: PointPairs, best: Sim3, cell: NDArray[np.int64]) -> Alignment | None:
+def _polish(pairs: PointPairs, best: Sim3, cell: Ints) -> Alignment | None:
     """Least squares over the inliers, with a threshold that shrinks."""
     inliers = residual_pixels(best, pairs) < SEARCH_PIXELS
     for limit in (SEARCH_PIXELS, SEARCH_PIXELS, FINAL_PIXELS, FINAL_PIXELS):
@@ -121,7 +121,7 @@ def _polish(pairs: PointPairs, best: Sim3, cell: NDArray[np.int64]) -> Alignment
     return Alignment(best, inliers, cells=count, median_pixels=median)
 
 
-def residual_pixels(target_from_source: Sim3, pairs: PointPairs) -> NDArray[np.float64]:
+def residual_pixels(target_from_source: Sim3, pairs: PointPairs) -> Array:
     """Larger of the two reprojection errors of each pair: each point in the other's image. [M]"""
     in_target = target_from_source.apply(pairs.source)
     in_source = target_from_source.inverse().apply(pairs.target)
@@ -130,9 +130,7 @@ def residual_pixels(target_from_source: Sim3, pairs: PointPairs) -> NDArray[np.f
     return np.maximum(a, b)
 
 
-def _reprojection(
-    poses: NDArray[np.float64], points: NDArray[np.float64], rays: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _reprojection(poses: Array, points: Array, rays: Array) -> Array:
     """Distance at depth 1; infinite behind the camera. [M]"""
     local = np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3]
     depth = local[:, 2]
@@ -141,13 +139,13 @@ def _reprojection(
     return np.where(ahead, np.linalg.norm(projected - rays, axis=1), np.inf)
 
 
-def fit_sim3(source: NDArray[np.float64], target: NDArray[np.float64]) -> Sim3 | None:
+def fit_sim3(source: Array, target: Array) -> Sim3 | None:
     """Least-squares similarity of points; None where they do not determine one. [N, 3]"""
     found = fit(source, target)
     return None if found is None else found.to_sim3()
 
 
-def cells(points: NDArray[np.float64]) -> NDArray[np.int64]:
+def cells(points: Array) -> Ints:
     """Cell of each point, numbered without gaps. [N, 3] -> [N]
 
     The grid lies in the plane of the two principal directions: scenes are wide and flat.
@@ -168,7 +166,7 @@ def cells(points: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(np.unique(key, return_inverse=True)[1], np.int64)
 
 
-def cell_weights(cell: NDArray[np.int64]) -> NDArray[np.float64]:
+def cell_weights(cell: Ints) -> Array:
     """Weight of each point such that a cell counts as the root of its number of points. [N]
 
     Between one vote for each point and one for each cell: an almost empty cell may be an accident.
@@ -177,15 +175,13 @@ def cell_weights(cell: NDArray[np.int64]) -> NDArray[np.float64]:
     return 1.0 / np.sqrt(counts[cell])
 
 
-def draw(
-    rng: np.random.Generator, members: list[NDArray[np.int64]], count: int
-) -> NDArray[np.int64]:
+def draw(rng: np.random.Generator, members: list[Ints], count: int) -> Ints:
     """Points of as many different cells. [count]"""
     chosen = rng.choice(len(members), count, replace=False)
     return np.array([members[c][rng.integers(len(members[c]))] for c in chosen])
 
 
-def cell_members(cell: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def cell_members(cell: Ints) -> list[Ints]:
     """Points of each cell."""
     order = np.argsort(cell, kind="stable")
     edges = np.flatnonzero(np.diff(cell[order])) + 1

@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.arrays import Mask
+from chronoscene.arrays import Ints, Mask
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.quality.rays import sampson_distance
 from chronoscene.registration.reconstruct.models import image_pose
@@ -28,7 +27,7 @@ STARTS = 10  # Images from which the trusted set is grown, one at a time
 MAX_MISPLACED = 0.4  # Share of the images beyond which it is not known which of them are wrong
 
 
-Matches = Mapping[tuple[int, int], NDArray[np.int64]]
+Matches = Mapping[tuple[int, int], Ints]
 """Verified matches of all pairs of images, by image ids. [M, 2] each"""
 
 Agreements = Mapping[tuple[int, int], tuple[int, int]]
@@ -98,7 +97,7 @@ def misplaced(
     return [ids[i] for i in np.flatnonzero(wrong)]
 
 
-def _grown(good: NDArray[np.int64], total: NDArray[np.int64], start: Mask) -> Mask:
+def _grown(good: Ints, total: Ints, start: Mask) -> Mask:
     """Grow the set of trusted images from a start. [N]"""
     inside = start.copy()
     agreeing, known = good @ inside, total @ inside
@@ -111,7 +110,7 @@ def _grown(good: NDArray[np.int64], total: NDArray[np.int64], start: Mask) -> Ma
         agreeing, known = agreeing + good[new], known + total[new]
 
 
-def _matrices(agreements: Agreements, ids: list[int]) -> tuple[NDArray[np.int64], ...]:
+def _matrices(agreements: Agreements, ids: list[int]) -> tuple[Ints, ...]:
     """Agreeing and all matches of pairs of images. [N, N] each"""
     position = {image_id: i for i, image_id in enumerate(ids)}
     counts = np.zeros((2, len(ids), len(ids)), np.int64)

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from chronoscene.arrays import Ints
 from chronoscene.colmap.model import read_model
 from chronoscene.errors import RegistrationError
 from chronoscene.registration.context import Context
@@ -238,7 +238,7 @@ def read_held_out(path: Path, names: tuple[str, ...], periods: Mapping[str, int]
     return HeldOutTracks(start.astype(np.int64), place, xy)
 
 
-def cross_matches(tracks: HeldOutTracks, periods: NDArray[np.int64]) -> tuple[CrossMatches, ...]:
+def cross_matches(tracks: HeldOutTracks, periods: Ints) -> tuple[CrossMatches, ...]:
     """Held-out tracks as matches between images of different periods, by pair of images."""
     track, count = track_owners(tracks.start), np.diff(tracks.start)
     # Each observation with every one of its track.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Mask
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.reconstruct.alignment import fit_sim3
 from chronoscene.registration.reconstruct.models import as_pycolmap, image_pose, sorted_ids
@@ -41,9 +41,9 @@ class GpsAlignment:
     """Alignment of a model to the frame of the GPS positions."""
 
     enu_from_model: Sim3
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     """Positions that agree with the model. [N]"""
-    residuals: NDArray[np.float64]
+    residuals: Array
     """Metres, NaN without a position. [N]"""
     rms: float
     """Root mean square residual of the inliers, metres."""
@@ -58,21 +58,18 @@ class GpsAlignment:
         return bool(self.inliers.sum() >= 3 and self.scale_error < MAX_SCALE_ERROR)
 
 
-def align_to_gps(
-    poses: NDArray[np.float64], enu: NDArray[np.float64], usable: NDArray[np.bool_]
-) -> GpsAlignment | None:
+def align_to_gps(poses: Array, enu: Array) -> GpsAlignment | None:
     """Fit a robust similarity from camera centres to GPS positions.
 
     Args:
         poses: ``cam_from_world`` of the model. [N, 4, 4]
         enu: Metres; NaN where unknown. [N, 3]
-        usable: Positions to use. [N]
 
     Returns:
         None with fewer than three positions.
     """
     centres = camera_centre(poses)
-    use = np.flatnonzero(usable & np.isfinite(enu).all(axis=1))
+    use = np.flatnonzero(np.isfinite(enu).all(axis=1))
     if len(use) < 3:
         return None
     similarity = _first_guess(poses[use], enu[use])
@@ -100,7 +97,7 @@ def align_to_gps(
     )
 
 
-def _first_guess(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
+def _first_guess(poses: Array, enu: Array) -> Sim3 | None:
     """Fit a similarity on which most positions agree; on a line, its rotation may be wrong."""
     centres = camera_centre(poses)
     result = fit_robustly(centres, enu)
@@ -118,18 +115,18 @@ def _first_guess(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 |
     return best
 
 
-def _median_distance(sim: Sim3, centres: NDArray[np.float64], enu: NDArray[np.float64]) -> float:
+def _median_distance(sim: Sim3, centres: Array, enu: Array) -> float:
     return float(np.median(np.linalg.norm(sim.apply(centres) - enu, axis=1)))
 
 
-def is_line(positions: NDArray[np.float64]) -> bool:
+def is_line(positions: Array) -> bool:
     """Return True if positions lie along a line, seen from above."""
     flat = positions[:, :2] - positions[:, :2].mean(axis=0)
     values = np.linalg.svd(flat, compute_uv=False)
     return bool(values[-1] < LINE_RATIO * values[0])
 
 
-def _fit_with_horizon(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
+def _fit_with_horizon(poses: Array, enu: Array) -> Sim3 | None:
     """Fit a similarity in which the photos also are upright, or look straight down.
 
     Each camera gets a second point above it, as far up as the cameras are spread along the line.
@@ -146,9 +143,7 @@ def _fit_with_horizon(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> S
     )
 
 
-def _fit_upwards(
-    poses: NDArray[np.float64], enu: NDArray[np.float64], up: NDArray[np.float64]
-) -> Sim3 | None:
+def _fit_upwards(poses: Array, enu: Array, up: Array) -> Sim3 | None:
     centres = camera_centre(poses)
     model_spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
     world_spread = float(np.linalg.norm(enu - enu.mean(axis=0), axis=1).mean())
@@ -157,7 +152,7 @@ def _fit_upwards(
     return fit_sim3(source, target)
 
 
-def upright_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def upright_direction(poses: Array) -> Array:
     """Upward unit vector, for photos taken without roll. [3]
 
     The horizontal axes of all images lie in the horizontal plane; where they are all parallel, the
@@ -178,7 +173,7 @@ def gps_alignment(model: pycolmap.Reconstruction, priors: Priors) -> GpsAlignmen
     nowhere = [np.nan] * 3
     enu = np.array([priors.enu.get(name, nowhere) for name in names], np.float64).reshape(-1, 3)
     poses = np.stack([image_pose(model.images[i]) for i in ids])
-    return align_to_gps(poses, enu, np.ones(len(enu), bool))
+    return align_to_gps(poses, enu)
 
 
 def to_gps_frame(

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.scene.geometry import pose_from_rotation_translation
 from chronoscene.scene.similarity import Sim3
 
 
-def image_pose(image: pycolmap.Image) -> NDArray[np.float64]:
+def image_pose(image: pycolmap.Image) -> Array:
     """``cam_from_world`` of a registered image. [4, 4]"""
     matrix = image.cam_from_world().matrix()
     return pose_from_rotation_translation(matrix[:, :3], matrix[:, 3])

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Ints
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.reconstruct.alignment import Alignment, PointPairs, align_by_points
 from chronoscene.registration.reconstruct.gps_alignment import GpsAlignment, Priors, gps_alignment
@@ -65,7 +65,7 @@ class Combined:
 
 def combine(
     submodels: Sequence[Submodel],
-    matches: Mapping[tuple[int, int], NDArray[np.int64]],
+    matches: Mapping[tuple[int, int], Ints],
     priors: Priors,
     database: str | Path,
     *,
@@ -139,11 +139,11 @@ def _describe(a: Submodel, b: Submodel, link: Alignment) -> str:
 
 
 def find_links(
-    submodels: Sequence[Submodel], matches: Mapping[tuple[int, int], NDArray[np.int64]]
+    submodels: Sequence[Submodel], matches: Mapping[tuple[int, int], Ints]
 ) -> dict[tuple[int, int], Alignment]:
     """Align submodel j to submodel i, for i < j with enough matches."""
     owner = {n: k for k, submodel in enumerate(submodels) for n in submodel.model.reg_image_ids()}
-    between: dict[tuple[int, int], list[tuple[int, int, NDArray[np.int64]]]] = {}
+    between: dict[tuple[int, int], list[tuple[int, int, Ints]]] = {}
     for (a, b), pairs in matches.items():
         i, j = owner.get(a), owner.get(b)
         if i is None or j is None or i == j:
@@ -162,7 +162,7 @@ def find_links(
 def point_pairs(
     source: pycolmap.Reconstruction,
     target: pycolmap.Reconstruction,
-    items: Sequence[tuple[int, int, NDArray[np.int64]]],
+    items: Sequence[tuple[int, int, Ints]],
 ) -> PointPairs | None:
     """Pairs of points of two models that matches join, each once; None if they are too few.
 

@@ -106,7 +106,7 @@ def read_tie_points(path: Path, *, scale: float = 1.0) -> TiePoints:
     filled = [(n, line.strip()) for n, line in enumerate(lines, 1) if line.strip()]
     if not filled:
         raise SceneError(path, expected="tie points", found="an empty file", todo=_TODO_CSV)
-    if _is_projection(filled[0][1]):
+    if re.match(r"(\+proj|EPSG:|WGS84)", filled[0][1], re.IGNORECASE):
         crs: str | None = _projection(path, filled[0][1])
         rows = _odm_rows(path, filled[1:])
     else:
@@ -219,10 +219,6 @@ def _odm_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
         # Without a name, a point is known by where it is.
         point = fields[6] if len(fields) > 6 and fields[6] else f"{fields[0]} {fields[1]}"
         yield point, Click(fields[5], u, v, line=number), (x, y, z)
-
-
-def _is_projection(line: str) -> bool:
-    return bool(re.match(r"(\+proj|EPSG:|WGS84)", line, re.IGNORECASE))
 
 
 def _projection(path: Path, line: str) -> str:

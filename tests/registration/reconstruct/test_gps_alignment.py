@@ -40,7 +40,7 @@ def test_gps_with_gross_outliers() -> None:
     wrong = [3, 11, 25]
     enu[wrong] += rng.uniform(50, 300, (3, 3))
     enu[7] = np.nan
-    found = align_to_gps(model, enu, np.ones(30, bool))
+    found = align_to_gps(model, enu)
     assert found is not None
     assert found.is_useful
     assert not found.inliers[[*wrong, 7]].any()
@@ -56,7 +56,7 @@ def test_gps_noise_as_large_as_the_scene_is_of_no_use() -> None:
     rng = np.random.default_rng(7)
     world = circle(12, radius=2.0)
     enu = camera_centre(world) + rng.normal(0, 3.0, (12, 3))
-    found = align_to_gps(world, enu, np.ones(12, bool))
+    found = align_to_gps(world, enu)
     assert found is not None
     assert not found.is_useful
 
@@ -71,7 +71,7 @@ def test_a_straight_walk_stands_upright_by_its_horizon() -> None:
     )
     model = WORLD_FROM_MODEL.inverse().apply_to_pose(world)
     enu = camera_centre(world) + rng.normal(0, 0.2, (20, 3))
-    found = align_to_gps(model, enu, np.ones(20, bool))
+    found = align_to_gps(model, enu)
     assert found is not None
     assert found.on_a_line
     aligned = found.enu_from_model.apply_to_pose(model)
@@ -82,7 +82,7 @@ def test_fewer_than_three_positions_say_nothing() -> None:
     world = circle(5)
     enu = np.full((5, 3), np.nan)
     enu[:2] = camera_centre(world)[:2]
-    assert align_to_gps(world, enu, np.ones(5, bool)) is None
+    assert align_to_gps(world, enu) is None
 
 
 def test_up_of_photos_that_look_straight_down() -> None:
