@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,143 +73,144 @@ def matches(path: Path) -> bool:
     return not transforms.head_has(place, RAW_KEY)
 
 
+@dataclass(frozen=True, slots=True)
+class _Document:
+    """A ``transforms.json``."""
+
+    root: Path
+    """The scene folder."""
+    data: dict[str, Any]
+    frames: dict[str, dict[str, Any]]
+    """Keys of each frame by the path of its image below the scene folder."""
+    places: dict[str, str]
+    """Place of each frame, for messages."""
+
+    @property
+    def place(self) -> Path:
+        return self.root / FILE
+
+
 def read(path: Path, *, period_by: str | None = None) -> Scene:
     """Read a scene."""
-    path = Path(path)
-    place = path / FILE
-    data = read_json_document(place)
-    frames = transforms.read_frames(place, data)
-    named = _by_name(path, frames)
-    images, tests, rule = _apply_lists(path, data, _read_images(path, data, named), named)
-    grouped = _group(place, data, {image.name: named[image.name][1] for image in images}, period_by)
+    file = _read_document(Path(path))
+    images, tests, rule = _apply_lists(file, _read_images(file))
+    grouped = _group(file, [image.name for image in images], period_by)
     scene = transforms.make_scene(
-        path,
+        file.root,
         images,
         grouped,
         default_tests(grouped[0]) if tests is None else tests,
-        points=_read_points(path, data),
+        points=_read_points(file),
         rule=rule,
         format=NAME,
     )
-    world = data.get("world")
+    world = file.data.get("world")
     return replace(
-        _to_original(path, data, scene),
-        world=parse_world(place, world) if isinstance(world, dict) else WorldFrame(),
-        masks=_find_masks(path, scene, named),
+        _to_original(file, scene),
+        world=parse_world(file.place, world) if isinstance(world, dict) else WorldFrame(),
+        masks=_find_masks(file, scene),
     )
 
 
 def remarks(path: Path) -> list[str]:
     """List the content that does not become part of a scene."""
-    data = read_json_document(path / FILE)
-    frames = transforms.read_frames(path / FILE, data)
-    depths = sum("depth_file_path" in frame for frame in frames)
+    file = _read_document(path)
+    depths = sum("depth_file_path" in frame for frame in file.frames.values())
     found = [f"depth maps of {depths} frames are not read"] if depths else []
-    if "fisheye_crop_radius" in data:
+    if "fisheye_crop_radius" in file.data:
         found.append("fisheye_crop_radius is not read: the border of the images is kept")
     if (path / COLMAP).is_dir():
-        if "applied_transform" not in data:
+        if "applied_transform" not in file.data:
             found.append(
                 f"there is no applied_transform and a model in {COLMAP}: the swap of axes that old "
                 "versions of nerfstudio made is undone"
             )
         found.append(f"{COLMAP} is not read, which has observations of points")
-    named = _by_name(path, frames)
-    images = _read_images(path, data, named)
-    if len(images) < len(frames):
-        found.append(f"{len(frames) - len(images)} frames are left out, as their image is missing")
-    kept, _, _ = _apply_lists(path, data, images, named)
-    if len(kept) < len(images):
-        found.append(f"{len(images) - len(kept)} frames are left out, as no list names them")
+    images = _read_images(file)
+    if missing := len(file.frames) - len(images):
+        found.append(f"{missing} frames are left out, as their image is missing")
+    if unlisted := len(images) - len(_apply_lists(file, images)[0]):
+        found.append(f"{unlisted} frames are left out, as no list names them")
     return found
 
 
-def _by_name(path: Path, frames: list[dict[str, Any]]) -> dict[str, tuple[str, dict[str, Any]]]:
-    """Map the path of each image to the place, for messages, and the keys of its frame."""
-    named: dict[str, tuple[str, dict[str, Any]]] = {}
-    for i, frame in enumerate(frames):
-        place = f"{path / FILE}: frames[{i}]"
-        name = transforms.image_name(place, path, "", frame.get("file_path"))
-        if name in named:
-            raise json_error(path / FILE, "each image once", f"{name!r} twice")
-        named[name] = place, frame
-    return named
+def _read_document(root: Path) -> _Document:
+    data = read_json_document(root / FILE)
+    file = _Document(root, data, {}, {})
+    for i, frame in enumerate(transforms.read_frames(file.place, data)):
+        place = f"{file.place}: frames[{i}]"
+        name = transforms.image_name(place, root, "", frame.get("file_path"))
+        if name in file.frames:
+            raise json_error(file.place, "each image once", f"{name!r} twice")
+        file.frames[name], file.places[name] = frame, place
+    return file
 
 
-def _find_masks(
-    path: Path, scene: Scene, named: Mapping[str, tuple[str, dict[str, Any]]]
-) -> dict[str, Path]:
+def _find_masks(file: _Document, scene: Scene) -> dict[str, Path]:
     """Return the mask of each frame that names one."""
     masks = {}
     for frame in scene.frames:
-        place, keys = named[scene.image_path(frame).relative_to(path).as_posix()]
-        if "mask_path" in keys:
-            place = f"{place}: mask_path"
-            mask = path / transforms.file_name(place, "", keys["mask_path"])
+        name = scene.image_path(frame).relative_to(file.root).as_posix()
+        if "mask_path" in file.frames[name]:
+            place = f"{file.places[name]}: mask_path"
+            mask = file.root / transforms.file_name(place, "", file.frames[name]["mask_path"])
             if not mask.is_file():
                 raise SceneError(mask, expected="a mask", found="nothing", todo="copy it there")
             masks[frame.name] = mask
     return masks
 
 
-def _read_images(
-    path: Path, data: Mapping[str, Any], named: Mapping[str, tuple[str, dict[str, Any]]]
-) -> list[PosedImage]:
+def _read_images(file: _Document) -> list[PosedImage]:
     """Read the frames whose image is there, of which there must be one."""
-    cameras, shared, images = CameraTable(), transforms.shared_keys(data), []
-    for name, (place, frame) in named.items():
-        if not os.path.isfile(path / name):
+    cameras, shared, images = CameraTable(), transforms.shared_keys(file.data), []
+    for name, frame in file.frames.items():
+        path, place = file.root / name, file.places[name]
+        if not os.path.isfile(path):
             continue
         world_from_cam = transforms.matrix(place, frame.get("transform_matrix"), (3, 4))
-        camera = cameras.camera(place, {**shared, **frame}, path / name)
+        camera = cameras.camera(place, {**shared, **frame}, path)
         pose = transforms.pose_from_opengl(place, world_from_cam)
         image_id = frame.get("colmap_im_id")
         images.append(PosedImage(image_id if type(image_id) is int else 0, name, camera, pose))
     if not images:
-        missing = path / next(iter(named))
-        raise SceneError(
-            missing, expected="an image", found="nothing", todo="copy the images there"
-        )
+        first = file.root / next(iter(file.frames))
+        raise SceneError(first, expected="an image", found="nothing", todo="copy the images there")
     return images
 
 
 def _apply_lists(
-    path: Path, data: Mapping[str, Any], images: list[PosedImage], known: Collection[str]
+    file: _Document, images: list[PosedImage]
 ) -> tuple[list[PosedImage], set[str] | None, str]:
     """Return the images that are used, the test images (None for the default), and the rule."""
-    place = path / FILE
-    lists = {key: _names(path, data, f"{key}_filenames", known) for key in ("train", "val", "test")}
-    if all(names is None for names in lists.values()):
+    train, val, test = (_names(file, f"{key}_filenames") for key in ("train", "val", "test"))
+    if train is None and val is None and test is None:
         return images, None, DEFAULT_RULE
-    tests = (lists["val"] or set()) | (lists["test"] or set())
-    train = lists["train"]
+    tests = (val or set()) | (test or set())
     if train is not None:
         if both := sorted(train & tests):
-            raise json_error(place, "train and test lists without common names", repr(both[0]))
+            found = repr(both[0])
+            raise json_error(file.place, "train and test lists without common names", found)
         images = [image for image in images if image.name in train | tests]
         if not images:
-            raise json_error(place, "frames that are in the lists of names", "none")
+            raise json_error(file.place, "frames that are in the lists of names", "none")
     return images, tests, "the lists of file names in transforms.json"
 
 
-def _names(
-    path: Path, data: Mapping[str, Any], key: str, known: Collection[str]
-) -> set[str] | None:
-    names, place = data.get(key), f"{path / FILE}: {key}"
+def _names(file: _Document, key: str) -> set[str] | None:
+    names, place = file.data.get(key), f"{file.place}: {key}"
     if names is None:
         return None
     if not isinstance(names, list):
         raise json_error(place, "a list", type(names).__name__)
-    found = {transforms.image_name(place, path, "", name) for name in names}
-    if lost := sorted(found.difference(known)):
+    found = {transforms.image_name(place, file.root, "", name) for name in names}
+    if lost := sorted(found.difference(file.frames)):
         raise json_error(place, "names of frames", repr(lost[0]), "correct the list")
     return found
 
 
-def _group(
-    place: Path, data: Mapping[str, Any], frames: Mapping[str, Mapping[str, Any]], by: str | None
-) -> grouping.Grouped:
-    """Group the frames into periods by their keys, or by the rule of the option."""
+def _group(file: _Document, names: list[str], by: str | None) -> grouping.Grouped:
+    """Group images into periods by the keys of their frames, or by the rule of the option."""
+    frames, place = {name: file.frames[name] for name in names}, file.place
     if by is None:
         keys = (key for key in ("period", "time") if any(key in f for f in frames.values()))
         by = next(keys, None)
@@ -218,9 +219,9 @@ def _group(
     if by.startswith(grouping.TABLE):
         return grouping.group_by_table(sorted(frames), Path(by.removeprefix(grouping.TABLE)))
     if by == "period":
-        return _group_by_ids(place, data, frames)
+        return _group_by_ids(file, frames)
     if by == "time" or by.startswith(("gap:", "count:")):
-        times = {name: _time(place, name, frame) for name, frame in frames.items()}
+        times = {name: _time(f"{place}: {name}", frame) for name, frame in frames.items()}
         distinct = len(set(times.values()))
         if by == "time" and distinct > max(1, len(times) // 2):
             raise ConfigError(
@@ -233,44 +234,42 @@ def _group(
     raise grouping.rule_error(by, PERIOD_BY)
 
 
-def _time(place: Path, name: str, frame: Mapping[str, Any]) -> float:
-    time = number(f"{place}: {name}", frame, "time")
+def _time(place: str, frame: Mapping[str, Any]) -> float:
+    time = number(place, frame, "time")
     if time is None:
-        raise json_error(f"{place}: {name}", "a time of every frame", "none")
+        raise json_error(place, "a time of every frame", "none")
     return time
 
 
-def _group_by_ids(
-    place: Path, data: Mapping[str, Any], frames: Mapping[str, Mapping[str, Any]]
-) -> grouping.Grouped:
+def _group_by_ids(file: _Document, frames: Mapping[str, Mapping[str, Any]]) -> grouping.Grouped:
     ids: dict[str, int] = {}
     for name, frame in frames.items():
         period = frame.get("period")
         if type(period) is not int or not 0 <= period < MAX_PERIODS:
-            raise json_error(f"{place}: {name}", "a period 0, 1, ...", repr(period)[:40])
+            raise json_error(f"{file.place}: {name}", "a period 0, 1, ...", repr(period)[:40])
         ids[name] = period
     used = sorted(set(ids.values()))
     if used != list(range(len(used))):
-        raise json_error(place, f"periods 0..{len(used) - 1} without gaps", str(used)[:60])
-    table = data.get("periods")
+        raise json_error(file.place, f"periods 0..{len(used) - 1} without gaps", str(used)[:60])
+    table = file.data.get("periods")
     if isinstance(table, list):
-        return ids, parse_periods(place, table, len(used))
+        return ids, parse_periods(file.place, table, len(used))
     return ids, tuple(Period(i, str(i)) for i in used)
 
 
-def _read_points(path: Path, data: Mapping[str, Any]) -> Points:
-    file = data.get("ply_file_path")
-    if file is None:
+def _read_points(file: _Document) -> Points:
+    name = file.data.get("ply_file_path")
+    if name is None:
         return Points.empty()
-    return read_points(path / transforms.file_name(f"{path / FILE}: ply_file_path", "", file))
+    return read_points(file.root / transforms.file_name(f"{file.place}: ply_file_path", "", name))
 
 
-def _to_original(path: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
+def _to_original(file: _Document, scene: Scene) -> Scene:
     """Undo ``applied_transform`` and ``applied_scale``."""
-    place = path / FILE
-    scale = number(place, data, "applied_scale")
-    applied = data.get("applied_transform")
-    if applied is None and (path / COLMAP).is_dir():
+    place = file.place
+    scale = number(place, file.data, "applied_scale")
+    applied = file.data.get("applied_transform")
+    if applied is None and (file.root / COLMAP).is_dir():
         applied = HISTORICAL
     if scale is None and applied is None:
         return scene
