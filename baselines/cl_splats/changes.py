@@ -11,6 +11,12 @@ from baselines.cl_splats.config import CLSplatsConfig
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+_PATCH = 0.006
+"""Standard deviation of the windows in which render and photo are compared, as a share of the width
+of the image; those of a second scale are twice as wide."""
+_STRUCTURE = 0.3  # Weight of 1 - structural similarity; chromaticity has weight 1
+_CLEANING = 0.006  # Radius of the opening and the closing of masks, as a share of the width
+_MIN_AREA = 0.0005  # Smaller spots are dropped; share of the area of the image
 _ROUNDS = 4
 """Rounds of the fit of colours; each leaves out what the one before fits worse than most."""
 _FIT_WIDTH = 80
@@ -22,14 +28,11 @@ _FLAT = 0.03**2
 
 
 def change_scores(
-    render: NDArray[np.floating],
-    photo: NDArray[np.uint8],
-    counts: Mask | None,
-    config: CLSplatsConfig,
+    render: NDArray[np.floating], photo: NDArray[np.uint8], counts: Mask | None
 ) -> Image:
     """Score of change of each pixel, 0 for none; the mean of two scales.
 
-        chromaticity + structure_weight (1 - structure)
+        chromaticity + 0.3 (1 - structure)
 
     Chromaticity is the sum over the channels of |l - mean l|, with l the difference of the
     logarithms of both images in a window: neither shadows nor darker surfaces are changes.
@@ -40,7 +43,6 @@ def change_scores(
         render: 0..1. [H, W, 3]
         photo: [H, W, 3]
         counts: Where the photo counts; None for everywhere. The others have score 0. [H, W]
-        config: Weights and the size of the windows.
     """
     counts = np.ones(photo.shape[:2], bool) if counts is None else counts
     if not counts.any():
@@ -50,13 +52,13 @@ def change_scores(
     truth[~counts] = image[~counts]
     total = np.zeros(photo.shape[:2], np.float32)
     for scale in (1, 2):
-        sigma = config.patch * scale * photo.shape[1]
+        sigma = _PATCH * scale * photo.shape[1]
         logs = [np.log(_blur(x, sigma).clip(0) + _DARK) for x in (truth, image)]
         difference = logs[0] - logs[1]
         total += np.abs(difference - difference.mean(-1, keepdims=True)).sum(-1)
         # What a short training leaves blurred is no change of structure.
         grey = [_blur(x, sigma / 2).mean(-1) for x in (truth, image)]
-        total += config.structure_weight * (1 - _structure(grey[0], grey[1], sigma))
+        total += _STRUCTURE * (1 - _structure(grey[0], grey[1], sigma))
     return np.where(counts, total / 2, 0.0)
 
 
@@ -68,14 +70,14 @@ def change_mask(scores: Image, config: CLSplatsConfig) -> Mask:
         config: Threshold and sizes.
     """
     width = scores.shape[1]
-    near = _disc(config.cleaning * width)
+    near = _disc(_CLEANING * width)
     # At the border everything goes on as it is there.
     mask = np.pad(scores >= config.change_threshold, len(near), mode="edge")
     mask = ndimage.binary_closing(ndimage.binary_opening(mask, near), near)
     mask = mask[len(near) : -len(near), len(near) : -len(near)]
     spots, count = ndimage.label(mask)
     areas = np.bincount(spots.ravel(), minlength=count + 1)
-    mask &= (areas >= config.min_area * scores.size)[spots]
+    mask &= (areas >= _MIN_AREA * scores.size)[spots]
     return np.asarray(ndimage.binary_dilation(mask, _disc(config.dilation * width)), bool)
 
 

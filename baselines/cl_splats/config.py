@@ -25,17 +25,8 @@ class CLSplatsConfig(GaussianConfig):
     """The other kind moves Gaussians to anywhere."""
 
     # Change detection
-    patch: NonNegativeFloat = 0.006
-    """Standard deviation of the windows in which render and photo are compared; those of a second
-    scale are twice as wide."""
-    structure_weight: NonNegativeFloat = 0.3
-    """Weight of 1 - structural similarity; chromaticity has weight 1."""
     change_threshold: NonNegativeFloat = 0.3
     """Score from which on a pixel has changed."""
-    cleaning: NonNegativeFloat = 0.006
-    """Radius of the opening and the closing of masks."""
-    min_area: NonNegativeFloat = 0.0005
-    """Smaller spots are dropped; share of the area of the image."""
     dilation: NonNegativeFloat = 0.012
     """Radius by which masks grow at last."""
 

@@ -98,7 +98,7 @@ def compare(
     view, photo, mask = train.views[index], train.load_image(index), train.load_mask(index)
     prediction = render(view, period)
     assert prediction.depth is not None
-    changed = change_mask(change_scores(prediction.rgb, photo, mask, config), config)
+    changed = change_mask(change_scores(prediction.rgb, photo, mask), config)
     counts = np.ones_like(changed) if mask is None else mask
     depth = np.where(prediction.depth > 0, prediction.depth, np.inf)
     return Comparison(view, photo, counts, changed & counts, depth)

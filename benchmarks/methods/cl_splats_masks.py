@@ -43,7 +43,7 @@ def look(method: CLSplats, part: Part, scene: Scene, out: Path) -> list[float]:
     for frame in scene.select(period=part.last):
         photo, counts = part.store.load(frame), part.store.load_mask(frame)
         image = method.render(part.view(frame), part.last - 1.0).rgb
-        found = change_scores(image, photo, counts, method.config)
+        found = change_scores(image, photo, counts)
         mask = change_mask(found, method.config)
         path = (out / frame.name).with_suffix(".png")
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -60,7 +60,7 @@ def emit_store(builder: Any, value: Any, address: Any) -> None:
 def _make_read(number: types.Type, element: ir.Type) -> Callable:
     @emitted(lambda memory, index: number(memory, types.intp))
     def read(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(emit_address(context, builder, sig.args[0], *args, element))
+        return builder.load(emit_address(context, builder, sig.args[0], *args, element=element))
 
     return read
 
@@ -68,7 +68,7 @@ def _make_read(number: types.Type, element: ir.Type) -> Callable:
 def _make_write(number: types.Type, element: ir.Type) -> Callable:
     @emitted(lambda memory, index, value: types.void(memory, types.intp, number))
     def write(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = emit_address(context, builder, sig.args[0], *args[:2], element)
+        address = emit_address(context, builder, sig.args[0], *args[:2], element=element)
         builder.store(args[2], address)
 
     return write

@@ -139,10 +139,8 @@ class World:
 
 
 def _label(state: Hashable) -> str:
-    """A state as text: its parts joined by spaces."""
-    if isinstance(state, tuple):
-        return " ".join(str(s) for s in state)
-    return str(state)
+    """A state as text: the items of a tuple joined by spaces."""
+    return " ".join(map(str, state if isinstance(state, tuple) else (state,)))
 
 
 def _edit(
@@ -153,14 +151,9 @@ def _edit(
         verb = CHANGE_VERBS.get(kind, "change")
     bounds = np.stack([p.bounds for p in meshes])
     low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    labels = (None if state is None else _label(state) for state in (before, after))
     return Edit(
-        period,
-        verb,
-        name,
-        kind,
-        None if before is None else _label(before),
-        None if after is None else _label(after),
-        (tuple(float(x) for x in low), tuple(float(x) for x in high)),
+        period, verb, name, kind, *labels, bounds=(tuple(low.tolist()), tuple(high.tolist()))
     )
 
 
