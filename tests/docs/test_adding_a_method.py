@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import importlib
 import os
 import re
 import subprocess
@@ -42,6 +43,18 @@ def test_the_packages_on_the_page_keep_all_rules(package, tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"{package}:SPEC: 0 of {len(CHECKS)} rules broken" in done.stdout
+
+
+def test_what_a_subclass_overrides_exists():
+    part = PAGE.partition("The base classes")[2].partition("\n\n`chronoscene.rasterizer")[0]
+    bullets = re.split(r"^- ", part, flags=re.MULTILINE)[1:]
+    assert len(bullets) == 3
+    for bullet in bullets:
+        words = re.findall(r"`([\w.]+)`", bullet)
+        places = [word.rpartition(".") for word in words if word.startswith("chronoscene.")]
+        classes = [getattr(importlib.import_module(module), name) for module, _, name in places]
+        known = {name for c in classes for name in (*dir(c), *c.__annotations__)}
+        assert {w for w in words if "." not in w} <= known
 
 
 def test_the_dataclasses_on_the_page_have_all_fields():

@@ -106,3 +106,12 @@ def test_what_a_page_names_exists(page: str) -> None:
         if match and match[1] not in GROUPS and not module_has(match[1]):
             wrong.append(span)
     assert not wrong
+
+
+def test_files_of_the_architecture_page_exist() -> None:
+    """Files that it names without a folder are in ``chronoscene/``, or in a folder named before."""
+    page = "docs/reference/architecture.md"
+    for span in code_spans(page):
+        if match := re.fullmatch(r"(\w+\.py)(?::([\w.]+))?", span):
+            files = [ROOT / "chronoscene" / match[1], *(ROOT / "baselines").rglob(match[1])]
+            assert any(file.is_file() for file in files), span
