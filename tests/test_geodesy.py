@@ -7,7 +7,7 @@ from chronoscene.geodesy import Georeference, from_crs, median_longitude
 
 PLACE = (51.5, 10.25)
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563
-"""Of WGS 84 (NIMA TR8350.2)."""
+"""Constants of WGS 84 (NIMA TR8350.2)."""
 
 
 def geocentric(latitude, longitude, height):

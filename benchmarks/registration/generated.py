@@ -94,7 +94,7 @@ class _Sightings:
 
 
 def generate_case(settings: CaseSettings) -> Generated:
-    """Make a registration as the settings say. Equal settings give equal arrays."""
+    """Make a registration with these settings. Equal settings give equal arrays."""
     rng = np.random.default_rng(settings.seed)
     stable = _city(rng, settings.points)
     tied = _tied(rng, settings, stable)

@@ -25,7 +25,7 @@ SETTINGS = SynthSettings(
 )
 
 IMAGES = 8
-"""Of each period."""
+"""Label of each period."""
 
 
 @dataclass

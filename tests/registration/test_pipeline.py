@@ -128,14 +128,14 @@ def test_route_separate(
 ) -> None:
     work = tmp_path / "work"
     shutil.copytree(joint[0].with_name("scene.work"), work, symlinks=True)
-    told: list[str] = []
+    reported: list[str] = []
     registered = run(
         read_captures(captures),
         tmp_path / "out",
         Options(threads=1, max_features=3000, route="separate", work=work),
-        report=lambda what, done, total: told.append(what),
+        report=lambda what, done, total: reported.append(what),
     )
-    assert "features" not in told  # found in the work folder
+    assert "features" not in reported  # found in the work folder
     assert registered.route == "separate"
     scene = read_scene(tmp_path / "out")
     degrees, share = errors(scene, truth, 0)
@@ -181,8 +181,8 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
     assert degrees < 1.0
     assert share < 0.02
     log = json.loads((out / "registration_log.json").read_text())
-    told = [remark for stage in log["stages"] for remark in stage["remarks"]]
-    assert any(r.startswith("2023/copy_of_2016.jpg") and "the same photo" in r for r in told)
+    remarks = [remark for stage in log["stages"] for remark in stage["remarks"]]
+    assert any(r.startswith("2023/copy_of_2016.jpg") and "the same photo" in r for r in remarks)
     assert not [f for f in validate_scene(out).findings if f.severity == "error"]
 
 

@@ -121,11 +121,11 @@ def odd_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(TASKS, name, f"odd_tasks:{name}")
 
 
-def test_a_task_gives_its_result_and_tells_its_progress(tmp_path: Path) -> None:
-    told: list[tuple[str, int, int]] = []
-    result = run_task("good", {"x": 21}, log=tmp_path / "log", report=lambda *p: told.append(p))
+def test_a_task_gives_its_result_and_reports_its_progress(tmp_path: Path) -> None:
+    reported: list[tuple[str, int, int]] = []
+    result = run_task("good", {"x": 21}, log=tmp_path / "log", report=lambda *p: reported.append(p))
     assert result == {"twice": 42}
-    assert told == [("counting", 1, 2)]
+    assert reported == [("counting", 1, 2)]
     assert "noise of a library" in (tmp_path / "log").read_text()
 
 

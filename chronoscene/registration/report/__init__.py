@@ -1,1 +1,1 @@
-"""``registration.html``: a certificate and its registration in, one page out."""
+"""A certificate in; ``registration.json``, and ``registration.html`` with comparisons, out."""

@@ -1,4 +1,4 @@
-"""Which photos share a camera."""
+"""Photos that share a camera."""
 
 from datetime import datetime, timedelta
 from pathlib import Path

@@ -40,7 +40,7 @@ ALL = ["0.jpg", "1.jpg", "2.jpg", "3.jpg", "4.jpg", "5.jpg"]
 
 @dataclass
 class Ran:
-    """What one run of features and matches did."""
+    """Work done by one run of features and matches."""
 
     carried: tuple[int, int] = (0, 0)
     """Photos and pairs."""
@@ -120,7 +120,7 @@ def every_pair(*groups: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def is_verified(key: Any, value: Any) -> bool:
-    """Whether an entry of the content is a pair with inliers."""
+    """Return True if an entry of the content is a pair with inliers."""
     return isinstance(key, tuple) and value[1][1] != b""
 
 
@@ -273,7 +273,7 @@ def test_pairs_of_other_cameras_are_matched_anew(
 
 
 def test_cameras_that_a_geometry_suggests_have_the_new_ids(photos: Path, tmp_path: Path) -> None:
-    """Where no focal length is known, COLMAP stores with a geometry the one that fits it."""
+    """COLMAP stores the fitted focal length with a geometry if none is known."""
     work = Work(tmp_path / "work", photos)
     work.run(ALL[:1], ALL[1:4])
     with pycolmap.Database.open(work.database) as opened:
@@ -536,22 +536,22 @@ def test_the_command_goes_on_from_the_run_before(
     captures: Path, photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_table(captures, "2016", "2016", "2023", "2023")
-    first, told, _ = matched(captures)
-    assert "reused" not in str(told)
-    assert told["matches"][0] == "6 pairs (6 exhaustive), 4 across periods"
+    first, remarks, _ = matched(captures)
+    assert "reused" not in str(remarks)
+    assert remarks["matches"][0] == "6 pairs (6 exhaustive), 4 across periods"
 
     write_table(captures, "2016", "2023", "2023", "2023")
-    moved, told, ran = matched(captures)
+    moved, remarks, ran = matched(captures)
     assert (ran.computed.get("features"), ran.computed["pairs"]) == (None, 0)
-    assert told["matches"][0] == "6 pairs (6 exhaustive), 3 across periods"
+    assert remarks["matches"][0] == "6 pairs (6 exhaustive), 3 across periods"
     assert moved.partners == first.partners
 
     shutil.copyfile(photos / ALL[4], captures / ALL[4])
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
-    more, told, _ = matched(captures)
-    verified = told["matches"][1]
-    assert told["features"][1:] == ["4 of 5 photos: features reused from the previous run"]
-    assert told["matches"][2] == "6 of 10 pairs: matches reused from the previous run"
+    more, remarks, _ = matched(captures)
+    verified = remarks["matches"][1]
+    assert remarks["features"][1:] == ["4 of 5 photos: features reused from the previous run"]
+    assert remarks["matches"][2] == "6 of 10 pairs: matches reused from the previous run"
     assert moved.keypoints.items() <= more.keypoints.items()
 
     # A photo goes, and comes back after a kill: then the record of the stage speaks of matches
@@ -562,8 +562,8 @@ def test_the_command_goes_on_from_the_run_before(
         with pytest.raises(RegistrationError, match="no_such_module"):
             matched(captures)
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
-    again, told, ran = matched(captures, seed=1)
+    again, remarks, ran = matched(captures, seed=1)
     reused = "6 of 10 pairs: matches reused from the previous run"
-    assert told["matches"][1:3] == [verified, reused]
+    assert remarks["matches"][1:3] == [verified, reused]
     assert ran.computed["pairs"] == 4
     assert again.partners == more.partners

@@ -1,4 +1,4 @@
-"""Which pairs are matched, what is similar, and what is held out."""
+"""Choice of pairs, similarity of images, and held-out tracks."""
 
 import numpy as np
 import pytest

@@ -256,10 +256,10 @@ def test_an_observation_agrees_within_three_pixels_or_three_deviations(
     assert held_out.noise == pytest.approx(error / expected)
 
 
-def test_points_that_are_placed_badly_tell_nothing(
+def test_points_that_are_placed_badly_are_not_measured(
     good: Registered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What leaves four pixels open is no measurement."""
+    """A transfer that is uncertain by more than four pixels is no measurement."""
     monkeypatch.setattr(certificate_module, "transfer_errors", constant(1.0, 3.99))
     assert isinstance(certify(good).pairs[0].held_out, HeldOut)
     monkeypatch.setattr(certificate_module, "transfer_errors", constant(1.0, 4.01))

@@ -352,7 +352,7 @@ def test_three_ties_are_a_link_and_two_are_none() -> None:
 
 
 def test_measured_tracks_link_without_any_tie() -> None:
-    """Clicked points alone, say, or held-out tracks alone."""
+    """Clicked points alone, or held-out tracks alone."""
     for measured in ({"by_all": misalignment()}, {"held_out": made().pairs[0].held_out}):
         verdict = judge(with_pair(apart(made(), (0, 1)), **measured))
         assert verdict.pairs[0, 1] == "doubtful"

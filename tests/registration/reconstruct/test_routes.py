@@ -12,11 +12,11 @@ from chronoscene.registration.reconstruct.routes import add_period, joint, separ
 from chronoscene.scene.geometry import camera_centre
 
 IMAGES = 8
-"""Of each period in the cases."""
+"""Label of each period in the cases."""
 
 MAX_DEGREES = 0.1
 MAX_SHARE = 0.002
-"""What is asked of registrations: 0.2% of the extent."""
+"""Largest error of a right registration: 0.2% of the extent."""
 
 
 def silent(what: str, done: int, total: int) -> None:

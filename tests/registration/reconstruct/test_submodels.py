@@ -44,7 +44,7 @@ def test_a_pair_of_points_counts_once_and_fits_both_images() -> None:
 
 
 def test_keypoints_without_a_ray_are_left_out() -> None:
-    """Where distortion is strong, the corners of a photo are images of nothing."""
+    """With strong distortion, no ray belongs to the corners of a photo."""
     model = generated()
     matches = same_points(model)
     model.cameras[1].params = [*model.cameras[1].params[:3], -5.0]
