@@ -32,7 +32,7 @@ class ChronoSceneError(Exception):
 
     @property
     def fields(self) -> dict[str, str]:
-        """The arguments by name."""
+        """Arguments by name."""
         return {key: getattr(self, key) for key in ("place", "expected", "found", "todo")}
 
     def __reduce__(self) -> tuple[Any, ...]:

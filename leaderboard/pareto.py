@@ -44,5 +44,15 @@ def plot(
     info = metric_info(metric)
     costs, quality = np.array([[p.cost, p.quality] for p in points]).T
     best = on_front(costs, quality if info.higher_is_better else -quality).tolist()
-    marks = [Mark(*p, 0.0, 0.0, is_best) for p, is_best in zip(points, best, strict=True)]
-    return panel_svg(Panel("", cost, info.title, marks, not info.higher_is_better), legend)
+    marks = [
+        Mark(number=p.number, x=p.cost, y=p.quality, on_front=is_best)
+        for p, is_best in zip(points, best, strict=True)
+    ]
+    panel = Panel(
+        title="",
+        x_label=cost,
+        y_label=info.title,
+        marks=marks,
+        lower_is_better=not info.higher_is_better,
+    )
+    return panel_svg(panel, legend)

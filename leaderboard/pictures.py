@@ -6,12 +6,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from PIL import Image
 
 from chronoscene.bench.files.ground_truth import ground_truth_folder
 from chronoscene.bench.files.predictions import ImageEntry, load_image, read_manifest
-from chronoscene.bench.files.records import PREDICTIONS, RunRecord, read_run, run_folders
+from chronoscene.bench.files.records import PREDICTIONS, read_run, run_folders
 from chronoscene.formats.shared.grouping import natural_key
 from leaderboard.entries import EntryRun, MeasuredEntry
 
@@ -31,13 +30,11 @@ def find_runs(folders: Iterable[Path], entries: Iterable[MeasuredEntry]) -> dict
     found = {}
     for run in (run for folder in folders for run in run_folders(folder)):
         hashes = frozenset((image.view, image.sha256) for image in _own(run / PREDICTIONS))
-        if (entry := wanted.get(hashes)) is not None and _same(entry.record, read_run(run)):
-            found[run] = entry
+        if (entry := wanted.get(hashes)) is not None:
+            known, record = entry.record, read_run(run)
+            if (known.scene_hash, known.config_hash) == (record.scene_hash, record.config_hash):
+                found[run] = entry
     return found
-
-
-def _same(first: RunRecord, second: RunRecord) -> bool:
-    return (first.scene_hash, first.config_hash) == (second.scene_hash, second.config_hash)
 
 
 def gallery(runs: Mapping[Path, str], folder: Path, place: str) -> dict[str, Any]:
@@ -64,7 +61,9 @@ def gallery(runs: Mapping[Path, str], folder: Path, place: str) -> dict[str, Any
     folder.mkdir(parents=True)
 
     def picture(source: Path, image: ImageEntry, name: str) -> str:
-        _write(load_image(source, image), folder / f"{name}.webp")
+        shown = Image.fromarray(load_image(source, image))
+        shown.thumbnail((WIDTH, WIDTH))
+        shown.save(folder / f"{name}.webp", "WEBP", quality=QUALITY)
         return f"{place}/{name}.webp"
 
     views = []
@@ -96,11 +95,3 @@ def _own(predictions: Path) -> list[ImageEntry]:
     """List the images of the period in which their camera stood."""
     images = read_manifest(predictions).images
     return [i for i in images if i.rendered_period == i.camera_period]
-
-
-def _write(rgb: NDArray[np.uint8], path: Path) -> None:
-    from PIL import Image
-
-    image = Image.fromarray(rgb)
-    image.thumbnail((WIDTH, WIDTH))
-    image.save(path, "WEBP", quality=QUALITY)

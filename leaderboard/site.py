@@ -42,6 +42,12 @@ OTHER_SCENES = "Other scenes"
 PARTS = {"real": "Real scenes of the paper", "synthetic": "Synthetic scenes of the paper"}
 COSTS = {"seconds": "training [s]", SIZE: "size [MB]", "peak_memory_bytes": "memory [MB]"}
 
+PRINTED_COLUMNS = (
+    *((name, "macro", metric_info(name).title) for name in PAPER_METRICS),
+    (SIZE, "", COSTS[SIZE]),
+)
+"""Quantity, column and title of the published numbers."""
+
 
 def write_site(
     entries: Collection[MeasuredEntry],
@@ -98,7 +104,8 @@ class _Site:
         self._page("published", "published.html")
         for scene, file in self.scenes.items():
             found = {run: r for run, r in pictured.items() if self.scene_of[r.scene] == scene}
-            found = dict(sorted(found.items(), key=_worst_last))
+            psnr = {run: r.aggregates["macro"].get("psnr", -math.inf) for run, r in found.items()}
+            found = dict(sorted(found.items(), key=lambda item: -psnr[item[0]]))
             views = [setting_of(r)[:-1] for r in found.values()]  # of one scene, split and width
             found = {run: r for run, r in found.items() if setting_of(r)[:-1] == views[0]}
             runs = {run: f"{r.title} ({kind_of(r)})" for run, r in found.items()}
@@ -144,7 +151,9 @@ class _Site:
                 "scenes": scenes,
                 "measured": [
                     {"method": m, "label": label, "effort": effort, "cells": cells}
-                    for (m, label, effort, *_), cells in sorted(measured.items(), key=_falling)
+                    for (m, label, effort, *_), cells in sorted(
+                        measured.items(), key=lambda item: _order(next(iter(item[1].values())))
+                    )
                 ],
                 "published": printed,
             }
@@ -161,9 +170,7 @@ class _Site:
         printed = self.printed[self.printed.scene == scene]
         groups = [_group(*group, printed, self.colors) for group in self._groups([scene])]
         if not groups:
-            columns = [(name, "macro", metric_info(name).title) for name in PAPER_METRICS]
-            columns.append((SIZE, "", COSTS[SIZE]))
-            groups = [_table(columns, printed[:0], printed)]
+            groups = [_table(PRINTED_COLUMNS, printed[:0], printed)]
         self._page(
             "scene",
             f"scene/{file}",
@@ -185,16 +192,14 @@ class _Site:
             for table in self.published.tables
             if (rows := [row for row in table.rows if row[0] in names])
         ]
-        columns = [(name, "macro", metric_info(name).title) for name in PAPER_METRICS]
-        columns.append((SIZE, "", COSTS[SIZE]))
         self._page(
             "method",
             f"method/{file}",
             method=method,
             spec=spec_of(method),
             measured=measured,
-            columns=[title for _, _, title in columns],
-            printed=_rows(printed, columns, by="scene"),
+            columns=[title for _, _, title in PRINTED_COLUMNS],
+            printed=_rows(printed, PRINTED_COLUMNS, by="scene"),
             repeated=len({self.scene_of[m["scene"]] for m in measured} & of_paper.keys()),
             tables=tables,
         )
@@ -313,16 +318,6 @@ def _cell(row: Any) -> dict[str, Any]:
 def _order(cell: dict[str, Any] | None) -> float:
     """Sort the largest first, and missing values last."""
     return -cell["value"] if cell else math.inf
-
-
-def _falling(item: tuple[Any, dict[str, Any]]) -> float:
-    """Sort rows of cells by their first."""
-    return _order(next(iter(item[1].values())))
-
-
-def _worst_last(item: tuple[Path, RunRecord]) -> float:
-    """Sort runs by PSNR, if it was computed."""
-    return -item[1].aggregates["macro"].get("psnr", -math.inf)
 
 
 def _file_names(names: Iterable[str]) -> dict[str, str]:

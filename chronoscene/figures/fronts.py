@@ -23,7 +23,7 @@ MANY_TICKS = 15  # Factor between the ends of an axis from which on few of its t
 DISC = 9.0  # Diameter in points of the discs with numbers
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Mark:
     """A configuration in a panel."""
 
@@ -31,13 +31,13 @@ class Mark:
     """In the legend."""
     x: float
     y: float
-    x_spread: float
-    y_spread: float
+    x_spread: float = 0.0
+    y_spread: float = 0.0
     """Half lengths of the error bars."""
     on_front: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
     """Qualities against one cost."""
 

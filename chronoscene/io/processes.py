@@ -103,7 +103,7 @@ class Outcome:
 
     @property
     def cause(self) -> str:
-        """``exit status 1``, ``signal SIGABRT``."""
+        """Status in words: ``exit status 1``, ``signal SIGABRT``."""
         if self.status >= 0:
             return f"exit status {self.status}"
         if -self.status == signal.SIGKILL:

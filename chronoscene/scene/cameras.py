@@ -104,7 +104,7 @@ class Camera:
 
     @property
     def distortion(self) -> tuple[float, ...]:
-        """The parameters after focal lengths and principal point."""
+        """Parameters after focal lengths and principal point."""
         return self.params[CAMERA_MODELS[self.model].num_focals + 2 :]
 
     @property

@@ -1,5 +1,6 @@
 """Pareto fronts as panels: every configuration is there, the front is drawn as steps."""
 
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -9,8 +10,25 @@ from PIL import Image
 from chronoscene.figures.canvas import EIGHT
 from chronoscene.figures.fronts import Mark, Panel, _draw_panel, _limits, draw_fronts, panel_svg
 
-MARKS = [Mark(1, 1.0, 20.0, 0.1, 0.5, True), Mark(2, 9.0, 25.0, 0.0, 0.0, True)]
-MARKS.append(Mark(3, 20.0, 19.0, 0.0, 0.0, False))
+MARKS = [
+    Mark(number=1, x=1.0, y=20.0, x_spread=0.1, y_spread=0.5, on_front=True),
+    Mark(number=2, x=9.0, y=25.0, on_front=True),
+    Mark(number=3, x=20.0, y=19.0, on_front=False),
+]
+
+
+def panel_of(marks, *, title="t", lower_is_better=False):
+    return Panel(
+        title=title,
+        x_label="training [s]",
+        y_label="PSNR [dB]",
+        marks=marks,
+        lower_is_better=lower_is_better,
+    )
+
+
+def on_axis(x, spread):
+    return Mark(number=1, x=x, y=1.0, x_spread=spread, on_front=True)
 
 
 def draw(path, rows):
@@ -21,7 +39,7 @@ def draw(path, rows):
 
 def test_panels_wrap_and_groups_have_colours(tmp_path, monkeypatch):
     monkeypatch.setattr("chronoscene.figures.fronts.MAX_COLUMNS", 2)
-    panel = Panel("plaza", "training [s]", "PSNR [dB]", MARKS, lower_is_better=False)
+    panel = panel_of(MARKS, title="plaza")
     few = draw(tmp_path / "new/few.png", [[panel] * 2])
     many = draw(tmp_path / "many.png", [[panel] * 3])
     assert many.shape[0] > few.shape[0] and many.shape[1] == few.shape[1]
@@ -34,7 +52,7 @@ def test_steps_follow_the_front_on_logarithmic_costs():
 
     axes = Figure().add_subplot()
     colors = dict(zip((1, 2, 3), EIGHT, strict=False))
-    _draw_panel(axes, Panel("t", "x", "y", MARKS, lower_is_better=True), colors)
+    _draw_panel(axes, panel_of(MARKS, lower_is_better=True), colors)
     assert axes.get_xscale() == "log" and axes.yaxis_inverted()
     steps = axes.lines[0]
     assert steps.get_drawstyle() == "steps-post"
@@ -45,16 +63,16 @@ def test_steps_follow_the_front_on_logarithmic_costs():
 
 
 def test_costs_that_hardly_differ_are_not_spread():
-    low, high = _limits([Mark(1, 90.01, 1.0, 0.0, 0.0, True), Mark(2, 90.03, 1.0, 0.0, 0.0, True)])
+    low, high = _limits([on_axis(90.01, 0.0), on_axis(90.03, 0.0)])
     assert high / low == pytest.approx(2) and low * high == pytest.approx(90.02**2)
-    low, high = _limits([Mark(1, 1.0, 1.0, 3.0, 0.0, True), Mark(2, 50.0, 1.0, 5.0, 0.0, True)])
+    low, high = _limits([on_axis(1.0, 3.0), on_axis(50.0, 5.0)])
     assert 0 < low < 0.5 and high > 55
 
 
 def test_a_panel_in_a_page_has_text_titles_and_equal_bytes():
-    panel = Panel("", "cost <s>", "quality", [Mark(1, 1.0, 2.0, 0.0, 0.0, True)], False)
+    panel = replace(panel_of(MARKS[:1]), x_label="cost <s>")
     svg, again = (panel_svg(panel, {1: ("<b>", "#aa0000")}) for _ in range(2))
     assert svg == again and "cost &lt;s&gt;</text>" in svg and "<title>&lt;b&gt;</title>" in svg
     root = ElementTree.fromstring(svg.replace("xlink:", ""))
-    assert root.get("aria-label") == "quality by cost <s>"
+    assert root.get("aria-label") == "PSNR [dB] by cost <s>"
     assert not [element for element in root.iter("g") if element.get("id")]

@@ -12,7 +12,7 @@ OPTIONS = ("iterations", "budget", "separate_iterations", "max_width")
 
 
 def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None) -> str:
-    """The command that trains a configuration; for a compressed one, also that which compresses it.
+    """Write the command that trains a configuration, and the one that compresses it, if any.
 
     Args:
         scene: Argument that stands for its folder.

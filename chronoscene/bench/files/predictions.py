@@ -181,7 +181,7 @@ class ImageWriter:
         return manifest
 
     def close_run(self, run: RunRecord) -> Manifest:
-        """`close` with what a run predicts."""
+        """Write the manifest of the predictions of a run."""
         return self.close(
             kind="predictions",
             scene=run.scene,
@@ -239,9 +239,8 @@ def _load_grey(
 ) -> NDArray[np.bool_] | None:
     if file is None or sha256 is None:
         return None
-    return np.asarray(
-        _load_png(folder, file, sha256, (entry.height, entry.width), color=False) != 0
-    )
+    size = entry.height, entry.width
+    return np.asarray(_load_png(folder, file, sha256, size, color=False) != 0)
 
 
 def _load_png(

@@ -31,7 +31,7 @@ STRATEGIES = {
 }
 """``joint``: one model, given the period. ``pooled``: one model, the period hidden from it.
 ``separate``: one model per period, which sees the images and points of that period alone.
-``sequential``: one model, which sees the images of one period after the other, and is told the
+``sequential``: one model, which sees the images of one period after the other, and is given the
 period if it takes one."""
 
 

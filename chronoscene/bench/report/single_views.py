@@ -21,7 +21,7 @@ WORST = 10
 
 
 def view_scores(records: Sequence[RunRecord], metric: str) -> DataFrame:
-    """A metric of every test view, averaged over seeds; a row per view and a column per method.
+    """Tabulate a metric of each test view, averaged over seeds: views in rows, methods in columns.
 
     Args:
         records: Runs with their rows, as from `chronoscene.bench.report.summary.read_runs`.
@@ -58,7 +58,7 @@ def view_scores(records: Sequence[RunRecord], metric: str) -> DataFrame:
 
 
 def worst_views(scores: DataFrame, records: Sequence[RunRecord], metric: str) -> Iterator[Table]:
-    """The `WORST` views of each scene, from `view_scores`."""
+    """Make a table of the `WORST` views of each scene, from `view_scores`."""
     info = metric_info(metric)
     for scene, part in scores.groupby(level="scene"):
         labels = next(run.period_labels for run in records if run.scene == scene)

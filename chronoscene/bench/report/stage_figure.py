@@ -16,7 +16,7 @@ from chronoscene.bench.report.summary import kind_of
 from chronoscene.bench.report.tables import period_name
 from chronoscene.bench.score.forgetting import stage_matrix
 from chronoscene.figures import canvas
-from chronoscene.metrics.registry import metric_info
+from chronoscene.metrics.registry import MetricInfo, metric_info
 
 METRICS = ("psnr", "ssim", "lpips_vgg")
 """Metrics that are drawn, as far as there are values."""
@@ -59,7 +59,7 @@ def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
             for records in rows.values()
         ]
         for axis, values, title in zip(row, found, rows, strict=True):
-            image = _draw_matrix(axis, values, found, names, info.decimals, info.higher_is_better)
+            image = _draw_matrix(axis, values, found, names, info)
             axis.set_title(f"{title}\n{info.title}", fontsize=9)
         figure.colorbar(image, ax=list(row), shrink=0.8, aspect=20)
     title = f"{scene}: test views of each period; below the red line, those of periods seen so far"
@@ -72,21 +72,20 @@ def _draw_matrix(
     values: NDArray[np.float64],
     found: Sequence[NDArray[np.float64]],
     names: Sequence[str],
-    decimals: int,
-    higher_is_better: bool,
+    metric: MetricInfo,
 ) -> Any:
     """Draw one heat map, in colours for the trained models of all those ``found``."""
     known = np.concatenate([matrix[1:][np.isfinite(matrix[1:])] for matrix in found])
     low, high = known.min(), known.max()
-    colors = "viridis" if higher_is_better else "viridis_r"
+    colors = "viridis" if metric.higher_is_better else "viridis_r"
     image = axis.imshow(values, vmin=low, vmax=high, cmap=colors)
     axis.set_facecolor("0.9")
     periods = len(names)
     for (row, column), value in np.ndenumerate(values):
         if periods <= WRITTEN and np.isfinite(value):
-            is_bright = (value - low > 0.6 * (high - low)) == higher_is_better
+            is_bright = (value - low > 0.6 * (high - low)) == metric.higher_is_better
             ink = "black" if is_bright else "white"
-            text = f"{value:.{decimals}f}"
+            text = f"{value:.{metric.decimals}f}"
             axis.text(column, row, text, ha="center", va="center", color=ink, fontsize=7)
     steps = np.arange(periods + 1)
     axis.step(steps - 0.5, np.minimum(steps + 0.5, periods + 0.5), where="post", color="red", lw=1)

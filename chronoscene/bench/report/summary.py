@@ -96,19 +96,19 @@ class Cost:
     name: str
     """Field of `RunRecord`."""
     title: str
-    factor: float
-    decimals: int
+    factor: float = 1.0
+    decimals: int = 0
 
 
 COSTS = (
-    Cost("seconds", "training [s]", 1.0, 1),
-    Cost("iterations", "iterations", 1.0, 0),
-    Cost("primitives", "primitives", 1.0, 0),
-    Cost("drawn", "drawn per view", 1.0, 0),
-    Cost("render_seconds", "rendering [ms]", 1e3, 1),
-    Cost(SIZE, "checkpoint [MB]", 1e-6, 3),
-    Cost("peak_memory_bytes", "peak memory [MB]", 1e-6, 0),
-    Cost("peak_device_memory_bytes", "peak GPU memory [MB]", 1e-6, 0),
+    Cost("seconds", "training [s]", decimals=1),
+    Cost("iterations", "iterations"),
+    Cost("primitives", "primitives"),
+    Cost("drawn", "drawn per view"),
+    Cost("render_seconds", "rendering [ms]", factor=1e3, decimals=1),
+    Cost(SIZE, "checkpoint [MB]", factor=1e-6, decimals=3),
+    Cost("peak_memory_bytes", "peak memory [MB]", factor=1e-6),
+    Cost("peak_device_memory_bytes", "peak GPU memory [MB]", factor=1e-6),
 )
 
 ENTRY_COLUMNS = (
@@ -123,8 +123,8 @@ ENTRY_COLUMNS = (
 runs in stages have ``<stage>: period <id>`` and `TRANSFERS`, too. ``sd`` is the sample standard
 deviation over ``n`` seeds, empty for one seed; ``low`` and ``high`` are the ends of the 95 %
 interval over views. ``difference`` is that to the best mean of the same scene, quantity and
-column, with its interval over the same views; ``tied`` says that views or seeds do not tell the two
-apart.
+column, with its interval over the same views; ``tied`` is True if views or seeds do not separate
+the two.
 """
 
 
@@ -224,10 +224,10 @@ def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> Data
     entries = values.value.agg(mean=mean, sd=spread, n="size")
     entries["resampled"] = [np.mean(list(part), axis=0) for _, part in values.resampled]
     entries = entries.reset_index().join(groups, on=["scene", "label"])
-    order = {scene: i for i, scene in enumerate(dict.fromkeys(run.scene for run in records))}
     entries = entries[entries.n == entries.runs].assign(source=MEASURED)
+    order = list(dict.fromkeys(run.scene for run in records))
     entries = entries.sort_values(
-        "scene", key=lambda scenes: scenes.map(order), kind="stable", ignore_index=True
+        "scene", key=lambda scenes: scenes.map(order.index), kind="stable", ignore_index=True
     )
     return compared(with_texts(entries))
 

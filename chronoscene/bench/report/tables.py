@@ -359,9 +359,9 @@ def footnotes(
     absent = []
     for run in records:
         costs = [(COST_TITLES.get(cost), why) for cost, why in run.absent.items()]
-        for name, reason in (*run.skipped.items(), *costs):
-            if name in wanted if wanted else name:
-                absent.append((reason, name))
+        for missing, reason in (*run.skipped.items(), *costs):
+            if missing in wanted if wanted else missing:
+                absent.append((reason, missing))
     notes += [f"absent: {names}: {reason}" for reason, names in _grouped(absent)]
     notes += dict.fromkeys(notice for run in records for notice in run.notices)
     failed = [((f"{f.scene}, {f.method} ({kind_of(f)})", f.reason), f.seed) for f in failures]

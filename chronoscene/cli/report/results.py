@@ -134,7 +134,7 @@ def table(
 
 
 def parse_metrics(texts: tuple[str, ...]) -> list[str]:
-    """Names of metrics from comma-separated lists.
+    """Split comma-separated lists of metrics.
 
     Raises:
         ConfigError: If there is no such metric.

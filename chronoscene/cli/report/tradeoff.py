@@ -189,4 +189,11 @@ def _mark(point: Any) -> Any:
     if point.cost == "render_seconds":
         x = 1 / point.value
         spread = x * (point.value_sd or 0.0) / point.value  # to first order
-    return Mark(point.number, x, point.quality, spread, point.quality_sd or 0.0, point.on_front)
+    return Mark(
+        number=point.number,
+        x=x,
+        y=point.quality,
+        x_spread=spread,
+        y_spread=point.quality_sd or 0.0,
+        on_front=point.on_front,
+    )

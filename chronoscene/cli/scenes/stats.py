@@ -200,7 +200,7 @@ def examine(
 
 
 def _scenes(folder: Path, request: StatsRequest) -> list[Path]:
-    """The scenes of a folder, and beside them what looks like one, so that nothing is lost."""
+    """Find the scenes of a folder, and folders that look like one, so that none is overlooked."""
     found = find_scenes(folder, format=request.dataset_format, period_by=request.period_by)
     if found == [folder]:
         return found
@@ -214,7 +214,7 @@ def _lost(item: tuple[Path, str]) -> Unreadable:
 
 
 def _file_names(paths: Sequence[Path]) -> list[str]:
-    """Names of the scenes, numbered where folders of several places have the same name."""
+    """Name the files of scenes, numbered where folders have the same name."""
     names: list[str] = []
     for path in paths:
         folder = path.resolve().name or "scene"
