@@ -46,14 +46,8 @@ from chronoscene.bench.train.loop import forget_peak_memory, train
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.formats import read_scene
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
-from chronoscene.methods import (
-    Method,
-    MethodSize,
-    StepReport,
-    TrainingSet,
-    import_object,
-    nothing_ahead,
-)
+from chronoscene.methods import Method, MethodSize, StepReport, TrainingSet, import_object
+from chronoscene.methods.interface import nothing_ahead
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.training.views import ViewSampler
 

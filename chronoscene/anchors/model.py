@@ -35,17 +35,6 @@ TABLES = (*PER_ANCHOR, "blocks")  # Trained tensors of which a view needs some r
 FIXED = ("anchors", "used_offsets", "block_rows")  # Tensors that are not trained
 _TENSORS = ("anchors", *TABLES, "block_rows", "global_features")  # Beside the MLPs
 LAYERS = HeadWeights._fields
-_ADDED_LATER = ("near_plane", "antialiased")
-"""Fields of `AnchorLayout` that the files of older models do not have."""
-_REMOVED = {
-    "direction_heads": list(HEADS),
-    "offset_unit": "anchor",
-    "scale_unit": "anchor",
-    "distance_heads": [],
-    "distance_scale": 1.0,
-    "feature_bank": False,
-}
-"""Fields that they may have, with the values that all models of today have."""
 _OUTPUTS = {"opacity": 1, "covariance": 7, "color": 3}
 
 
@@ -83,13 +72,10 @@ class AnchorLayout:
     @classmethod
     def from_meta(cls, meta: Mapping[str, Any]) -> AnchorLayout:
         """Read what ``dataclasses.asdict`` stored in ``model.json``."""
-        fields = dataclasses.fields(cls)
-        values: dict[str, Any] = {f.name: f.default for f in fields if f.name in _ADDED_LATER}
-        for key, value in meta.items():
-            # With no MLP that sees distances, their scale means nothing.
-            if _REMOVED.get(key, ...) != value and key != "distance_scale":
-                values[key] = tuple(value) if isinstance(value, list) else value
-        known = {f.name for f in fields}
+        values: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in meta.items()
+        }
+        known = {f.name for f in dataclasses.fields(cls)}
         if set(values) != known:
             raise CheckpointError(
                 "model.json: layout",

@@ -7,6 +7,7 @@ over, what carries nothing is dropped, and periods come to share blocks that are
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,37 +48,25 @@ class DrawnView(NamedTuple):
     info: RasterInfo
 
 
+@dataclass(eq=False)
 class DensityControl:
-    """Statistics of the views, and the rounds that change the anchors of a model.
+    """Statistics of the views, and the rounds that change the anchors of a model."""
 
-    Args:
-        config: Options of the method.
-        optimizer: Holds the model.
-        train: Views that say which anchors carry something.
-        voxel_size: Smallest growth cell in training units.
-        seed: Random growth follows from it.
-        feature_rows: Row of the varying features of each view. [V]
-        merge_share: Share by which the loss may rise where periods come to share blocks; 0: none.
-    """
-
-    def __init__(
-        self,
-        config: AnchorConfig,
-        optimizer: AnchorOptimizer,
-        train: TrainingSet,
-        *,
-        voxel_size: float,
-        seed: int,
-        feature_rows: NDArray[np.int64],
-        merge_share: float,
-    ) -> None:
-        self.config, self.optimizer, self.train = config, optimizer, train
-        self.voxel_size, self.feature_rows = voxel_size, feature_rows
-        self.merge_share = merge_share
-        self.generator = np.random.default_rng((seed, 1))
-        self.statistics: DensityStatistics | None = None
-        self.block_statistics: BlockStatistics | None = None
-        self._dropped = False
+    config: AnchorConfig
+    optimizer: AnchorOptimizer
+    """Holds the model."""
+    train: TrainingSet
+    voxel_size: float
+    """Smallest growth cell in training units."""
+    feature_rows: NDArray[np.int64]
+    """Row of the varying features of each view. [V]"""
+    merge_share: float
+    """Share by which the loss may rise where periods come to share blocks; 0: they share none."""
+    generator: np.random.Generator
+    """Decides where anchors grow at random."""
+    statistics: DensityStatistics | None = None
+    block_statistics: BlockStatistics | None = None
+    _dropped: bool = False
 
     def collect(self, drawn: DrawnView, loss: float, done: float) -> None:
         """Add a view to the statistics, if they count now.

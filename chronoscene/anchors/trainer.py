@@ -58,9 +58,9 @@ class AnchorTrainer:
             self.optimizer,
             train,
             voxel_size=self.voxel_size,
-            seed=seed,
             feature_rows=self.feature_rows,
             merge_share=self.merge_share,
+            generator=np.random.default_rng((seed, 1)),
         )
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)

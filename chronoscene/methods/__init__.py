@@ -14,10 +14,17 @@ A method that splats Gaussians need not implement all of `Method`: `GaussianMeth
 
 from __future__ import annotations
 
-from chronoscene.methods.interface import Method, MethodSize, Prediction, Skipped, StepReport
+from chronoscene.methods.interface import (
+    Method,
+    MethodSize,
+    Prediction,
+    StepReport,
+    TrainingSet,
+    TrainingView,
+    View,
+)
 from chronoscene.methods.options import (
     MethodConfig,
-    Option,
     as_typed,
     build_config,
     check_options,
@@ -25,10 +32,8 @@ from chronoscene.methods.options import (
     options_of,
 )
 from chronoscene.methods.spec import (
-    ENTRY_POINT_GROUP,
     PROGRAM_GROUP,
     MethodSpec,
-    PeriodInput,
     ProgramConfig,
     Runner,
     import_object,
@@ -36,21 +41,16 @@ from chronoscene.methods.spec import (
     load_spec,
     method_names,
 )
-from chronoscene.methods.views import TrainingSet, TrainingView, View, no_mask, nothing_ahead
 
 __all__ = [
-    "ENTRY_POINT_GROUP",
     "PROGRAM_GROUP",
     "Method",
     "MethodConfig",
     "MethodSize",
     "MethodSpec",
-    "Option",
-    "PeriodInput",
     "Prediction",
     "ProgramConfig",
     "Runner",
-    "Skipped",
     "StepReport",
     "TrainingSet",
     "TrainingView",
@@ -63,7 +63,5 @@ __all__ = [
     "installed_methods",
     "load_spec",
     "method_names",
-    "no_mask",
-    "nothing_ahead",
     "options_of",
 ]

@@ -1,19 +1,82 @@
-"""The interface of a method, and what it hands to the harness."""
+"""Interface of a method: what the harness gives it, and what it hands back."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.methods.views import TrainingSet, View
+from chronoscene.methods.options import MethodConfig
 from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.scene.similarity import Sim3
 
 Skipped = Literal["empty", "not finite"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A pinhole camera to render: intrinsics in pixels, pose in the training frame."""
+
+    K: NDArray[np.float64]
+    """[3, 3]"""
+    width: int
+    height: int
+    cam_from_world: NDArray[np.float64]
+    """[4, 4]; the world here is the training frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingView(View):
+    """A view with an image to learn from."""
+
+    name: str
+    period: int
+
+
+def no_mask(index: int) -> None:
+    """`TrainingSet.load_mask` of sets whose images count everywhere."""
+
+
+def nothing_ahead(indices: Sequence[int]) -> None:
+    """`TrainingSet.expect` of sets whose images are at hand."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingSet:
+    """Data that a method may learn from, in the normalised training frame.
+
+    The training frame is the world, recentred and scaled in float64 before anything is cast to
+    float32: learning rates and voxel sizes depend on its scale. The inverse of
+    `training_from_world` leads back.
+    """
+
+    views: tuple[TrainingView, ...]
+    num_periods: int
+    """1 where the harness hides the period; those so far where they arrive one after the other."""
+    points: NDArray[np.float32]
+    """Sparse points that a training view of these periods sees. [P, 3]"""
+    colors: NDArray[np.uint8]
+    """[P, 3]"""
+    point_periods: NDArray[np.bool_]
+    """True where a training view of the period sees the point. [P, T]"""
+    training_from_world: Sim3
+    camera_extent: float
+    """1.1 times the largest distance of a training camera from their mean, in training units."""
+    background: NDArray[np.float32]
+    """Colour behind everything, 0..1. [3]"""
+    load_image: Callable[[int], NDArray[np.uint8]]
+    """Image of ``views[i]``, decoded lazily and cached. [H, W, 3]"""
+    load_mask: Callable[[int], NDArray[np.bool_] | None] = no_mask
+    """Pixels of ``views[i]`` that count; None if all do. The others must not change the model.
+    [H, W]"""
+    expect: Callable[[Sequence[int]], None] = nothing_ahead
+    """Function to call with the views whose images will be loaded next, in their order: they are
+    decoded while the method does something else. A method that never calls it waits for each
+    image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +122,7 @@ class MethodSize:
 class Method(Protocol):
     """Interface of a method. ``method(config)`` makes one, `setup` or `load` fills it."""
 
-    def __init__(self, config: Any) -> None: ...
+    def __init__(self, config: MethodConfig) -> None: ...
 
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
         """Build the initial model. Nothing else draws from the global random state."""

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from chronoscene.methods import Skipped, TrainingSet
+from chronoscene.methods import TrainingSet
+from chronoscene.methods.interface import Skipped
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.devices import to_device
 from chronoscene.training.optimizers.adam import all_finite

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.methods import TrainingView, nothing_ahead
+from chronoscene.methods import TrainingView
+from chronoscene.methods.interface import nothing_ahead
 
 AHEAD = 32
 """Number of draws that are known before they are made."""

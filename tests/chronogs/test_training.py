@@ -19,7 +19,6 @@ from chronoscene.anchors.density import DensityStatistics
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet
-from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.scene.similarity import Sim3
 from chronoscene.training.schedules import log_linear
 
@@ -288,23 +287,6 @@ def test_a_near_plane_is_trained_stored_and_rendered_with(
     assert ours.depth[ours.alpha > 0].min() >= 2.0
     usual = train(_set_up(ChronoGSConfig(**options), noise_set(2)), 24).render(view, 0)
     assert usual.depth[usual.alpha > 0].min() < 2.0
-
-
-def test_models_from_before_all_rules_were_stored_have_the_defaults(
-    noise_set: Callable[[int], TrainingSet], method: Make, tmp_path: Path
-) -> None:
-    made = method(length_unit="training")
-    made.save(tmp_path)
-    meta = json.loads((tmp_path / "model.json").read_text())
-    del meta["layout"]["near_plane"], meta["config"]["near_plane"]
-    del meta["layout"]["antialiased"]
-    meta["layout"] |= {"feature_bank": False, "distance_heads": [], "distance_scale": 0.1}
-    (tmp_path / "model.json").write_text(json.dumps(meta))
-    loaded = ChronoGS(ChronoGSConfig(near_plane=1.0))
-    loaded.load(tmp_path, device="cpu")
-    assert loaded.model.layout.near_plane == NEAR_PLANE
-    view = noise_set(3).views[0]
-    np.testing.assert_array_equal(made.render(view, 1).rgb, loaded.render(view, 1).rgb)
 
 
 def test_a_model_of_another_layout_is_refused(method: Make, tmp_path: Path) -> None:

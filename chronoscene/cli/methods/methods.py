@@ -16,12 +16,12 @@ from chronoscene.cli.output import emit
 from chronoscene.methods import (
     PROGRAM_GROUP,
     MethodSpec,
-    Option,
     as_typed,
     load_spec,
     method_names,
     options_of,
 )
+from chronoscene.methods.options import Option
 
 
 @click.command("methods")

@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from numba import prange
 from numpy import float32
@@ -200,38 +199,9 @@ def all_finite(tensors: Sequence[Tensor]) -> Tensor:
     Returns:
         A scalar on the device of the tensors. bool
     """
-    if not devices.has_kernels(*tensors):
-        return torch.stack([tensor.isfinite().all() for tensor in tensors]).all()
-    return torch.tensor(all(map(_is_finite, tensors)))
-
-
-def _is_finite(tensor: Tensor) -> bool:
-    bits = tensor.detach().contiguous().view(-1).numpy().view(np.int32)
-    largest = largest_bits_of_blocks(bits) if len(bits) > BLOCK else largest_bits(bits)
-    return bool(largest < INFINITY_BITS)
-
-
-INFINITY_BITS = 0x7F800000
-"""Magnitude bits of a float32: those of finite numbers are smaller, those of nan larger."""
-
-
-@kernel
-def largest_bits(bits):  # type: ignore[no-untyped-def]
-    """Find the largest magnitude of float32 numbers given as int32, as an integer."""
-    largest = np.int32(0)
-    for i in range(bits.shape[0]):
-        largest = max(largest, bits[i] & np.int32(0x7FFFFFFF))
-    return largest
-
-
-@kernel(parallel=True)
-def largest_bits_of_blocks(bits):  # type: ignore[no-untyped-def]
-    """Find `largest_bits` of a large array, blocks spread over the threads."""
-    size = bits.shape[0]
-    found = np.empty((size + BLOCK - 1) // BLOCK, np.int32)
-    for block in prange(len(found)):
-        found[block] = largest_bits(bits[block * BLOCK : min((block + 1) * BLOCK, size)])
-    return found.max()
+    # The largest magnitude is nan if any number is.
+    largest = [tensor.detach().abs().amax() for tensor in tensors if tensor.numel()]
+    return torch.stack(largest).isfinite().all() if largest else torch.tensor(True)
 
 
 class DenseTable:
