@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
@@ -51,8 +50,7 @@ def of_other_period(scene: RawScene) -> dict[str, tuple[datetime, datetime, int]
         own = medians.get((scene.periods or {})[name])
         if own is None:
             continue
-        at = bisect(ordered, (taken, 0))
-        median, period = min(ordered[max(0, at - 1) : at + 1], key=lambda m: abs(m[0] - taken))
+        median, period = min(ordered, key=lambda m: abs(m[0] - taken))
         if abs(median - own) >= DAY and abs(taken - median) < MUCH_NEARER * abs(taken - own):
             wrong[name] = (taken, own, period)
     return wrong
