@@ -123,9 +123,9 @@ def command(
     coverage; docs/guides/statistics.md defines them. Periods are numbered from 0; "-" means that
     there is nothing to measure.
 
-    All periods of a scene share one point cloud. Each point is counted once, in the period with the
-    most observations of it, the earliest of several; with --count seen, in every period that sees
-    it.
+    All periods of a scene share one point cloud, and the paper does not say how its table splits
+    it. Here, each point is counted once, in the period with the most observations of it, the
+    earliest of several; with --count seen, in every period that sees it.
 
     Scenes that cannot be read are named, the others are reported. Exit status: 0 if all scenes
     were read, 1 if some were, 2 if none was or the command is used wrongly.
