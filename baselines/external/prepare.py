@@ -21,9 +21,9 @@ from chronoscene.methods import ProgramConfig
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 
-OFF_CENTRE = 0.5  # Pixels of the principal point from the centre that are told
+OFF_CENTRE = 0.5  # Pixels of the principal point from the centre that are reported
 
-SAME_FOCAL = 1e-3  # Relative difference of focal lengths that is told
+SAME_FOCAL = 1e-3  # Relative difference of focal lengths that is reported
 
 PUBLISHED_ITERATIONS = "40_000"
 """Iterations, and the ends of schedules, as the config file of ChronoGS writes them."""

@@ -9,7 +9,7 @@ from chronoscene.gaussians.method import GaussianMethod
 class GaussianSplatting(GaussianMethod):
     """One static scene of Gaussians, trained on all views alike.
 
-    The period is not told to it: every period renders the same image.
+    The period is no input: every period renders the same image.
 
     Source: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering".
     Different on purpose: the principal point is kept; the near plane is that of all methods here.

@@ -60,7 +60,7 @@ def save_tensors(
     Raises:
         DiskFullError: If there is no space for them.
     """
-    # Copies, since views that share memory cannot be told apart in the file.
+    # Copies, since views that share memory cannot be distinguished in the file.
     stored = {k: tensors[k].detach().cpu().contiguous().clone() for k in sorted(tensors)}
     with replacing(folder / f"{stem}.safetensors") as partial:
         try:

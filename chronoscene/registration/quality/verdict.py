@@ -83,7 +83,7 @@ THRESHOLDS: dict[str, Threshold] = {
             key="shift",
             what="remaining displacement between two periods",
             unit="% of extent", doubtful=0.2, fail=0.2,
-            why="0.2% is 20 cm in 100 m: smaller changes cannot be told from misalignment",
+            why="0.2% is 20 cm in 100 m: smaller changes cannot be distinguished from misalignment",
             todo=_CLICK,
         ),
         Threshold(

@@ -15,7 +15,7 @@ from chronoscene.validation.checks.photo_metadata import fit_gps
 from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import NOTHING, Hit
 
-MIN_SHARED = 10  # Shared points from which a similarity between two periods can be told from chance
+MIN_SHARED = 10  # Shared points from which a similarity between two periods can be more than chance
 MAX_BLOCK = 10_000_000  # Points times periods that are counted at a time
 
 UNIT_TOLERANCE = 0.1
