@@ -69,7 +69,7 @@ def test_a_run_among_others_reports_its_share_and_notes(monkeypatch, capsys):
         for name in ("period-0", "period-1"):
             display.begin(name, StopRule(10, None))
             display.update(5, 1.0, StepReport(0.5, 7), 20.0)
-        display.say("going on")
+        display.log("going on")
     shares = [(done, total) for _, done, total in told]
     assert shares == [(250, 1000), (750, 1000), (0, 0)] and told[-1][0] == "x period-1: going on"
     assert capsys.readouterr() == ("", "")
