@@ -70,7 +70,7 @@ def _features(inputs: PhotoInputs, context: Context) -> dict[str, Any]:
 
 
 def _reused(count: int, total: int, what: str) -> list[str]:
-    return [f"{count} of {total} {what} reused from the previous run"] if count else []
+    return [f"{count} of {total} {what} reused from an earlier run"] if count else []
 
 
 def _matches(inputs: PhotoInputs, context: Context) -> dict[str, Any]:

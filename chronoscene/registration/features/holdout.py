@@ -60,24 +60,27 @@ def build_tracks(matches: Mapping[tuple[int, int], Ints], keypoints: Mapping[int
         keypoints: Pixels of the keypoints of each image. [K, 2]
     """
     ids = sorted(keypoints)
-    starts = np.concatenate([[0], np.cumsum([len(keypoints[i]) for i in ids])])
+    starts = np.cumsum([0, *(len(keypoints[i]) for i in ids)])
     offset = {image: int(start) for image, start in zip(ids, starts, strict=False)}
     total = int(starts[-1])
-    place = [offset[i] + first_at_place(keypoints[i]) for i in ids]
-    alias = np.concatenate([np.zeros(0, np.int64), *place])
-    a = [offset[i] + m[:, 0] for (i, _), m in matches.items()]
-    b = [offset[j] + m[:, 1] for (_, j), m in matches.items()]
-    first = alias[np.concatenate([np.zeros(0, np.int64), *a])]
-    second = alias[np.concatenate([np.zeros(0, np.int64), *b])]
+    nothing = np.zeros(0, np.int64)
+    # Nodes are keypoints, numbered over all images; several at one pixel are the first of them.
+    alias = np.concatenate([nothing, *(offset[i] + first_at_place(keypoints[i]) for i in ids)])
+    edges = [np.add(pairs, (offset[i], offset[j])) for (i, j), pairs in matches.items()]
+    first, second = alias[np.concatenate([nothing.reshape(0, 2), *edges])].T
     graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(total, total))
     _, labels = connected_components(graph, directed=False)
     used = np.unique(np.concatenate([first, second]))
-    compact = np.unique(labels[used], return_inverse=True)[1]
     node_track = np.full(total, -1, np.int64)
-    node_track[used] = compact
-    image = np.asarray(ids, np.int64)[np.searchsorted(starts, used, side="right") - 1]
-    keypoint = used - np.asarray([offset[i] for i in image.tolist()], np.int64)
-    return Tracks(image, keypoint, node_track[used], offset, node_track[alias])
+    node_track[used] = np.unique(labels[used], return_inverse=True)[1]
+    slot = np.searchsorted(starts, used, side="right") - 1
+    return Tracks(
+        image=np.array(ids, np.int64)[slot],
+        keypoint=used - starts[slot],
+        track=node_track[used],
+        offset=offset,
+        node_track=node_track[alias],
+    )
 
 
 def first_at_place(xy: Array) -> Ints:

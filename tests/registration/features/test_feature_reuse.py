@@ -550,8 +550,8 @@ def test_the_command_goes_on_from_the_run_before(
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
     more, remarks, _ = matched(captures)
     verified = remarks["matches"][1]
-    assert remarks["features"][1:] == ["4 of 5 photos: features reused from the previous run"]
-    assert remarks["matches"][2] == "6 of 10 pairs: matches reused from the previous run"
+    assert remarks["features"][1:] == ["4 of 5 photos: features reused from an earlier run"]
+    assert remarks["matches"][2] == "6 of 10 pairs: matches reused from an earlier run"
     assert moved.keypoints.items() <= more.keypoints.items()
 
     # A photo goes, and comes back after a kill: then the record of the stage speaks of matches
@@ -563,7 +563,7 @@ def test_the_command_goes_on_from_the_run_before(
             matched(captures)
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
     again, remarks, ran = matched(captures, seed=1)
-    reused = "6 of 10 pairs: matches reused from the previous run"
+    reused = "6 of 10 pairs: matches reused from an earlier run"
     assert remarks["matches"][1:3] == [verified, reused]
     assert ran.computed["pairs"] == 4
     assert again.partners == more.partners
