@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -18,12 +17,6 @@ OPENING = re.compile(r"\s*(What|Whether|Where|How|Of|Those|Which|When|Who|Why|Th
 
 PRIVATE_WORDS = re.compile(r"\bSay\b|\btold\b|\btells\b|\bthis room\b|\brooms\b")
 """Names and words that the code does without: `Log`; reported, warned; package."""
-
-OPENING_NOT_YET: tuple[str, ...] = ("chronoscene/bench/plan/", "chronoscene/bench/run/")
-"""Paths, or their beginnings, with docstrings that open with one of `OPENING`."""
-
-WORDS_NOT_YET: tuple[str, ...] = ("chronoscene/bench/files/", "chronoscene/bench/run/")
-"""Paths, or their beginnings, with one of `PRIVATE_WORDS`."""
 
 
 def sources() -> Iterator[tuple[str, str]]:
@@ -51,56 +44,22 @@ def docstrings(text: str) -> Iterator[tuple[int, str]]:
                 yield statement.lineno, statement.value.value
 
 
-@cache
-def bad_openings() -> dict[str, list[str]]:
-    """Places with a docstring that opens with a wrong word, per file."""
-    found = {
-        path: [f"{path}:{n}: {doc[:60]!r}" for n, doc in docstrings(text) if OPENING.match(doc)]
-        for path, text in sources()
-    }
-    return {path: places for path, places in found.items() if places}
-
-
-@cache
-def private_words() -> dict[str, list[str]]:
-    """Places with a private word, per file."""
-    found = {
-        path: [
-            f"{path}:{n}: {line.strip()[:80]}"
-            for n, line in enumerate(text.splitlines(), 1)
-            if PRIVATE_WORDS.search(line)
-        ]
-        for path, text in sources()
-    }
-    return {path: places for path, places in found.items() if places}
-
-
 def test_docstrings_open_with_a_verb_or_a_noun() -> None:
     assert not [
-        p
-        for path, places in bad_openings().items()
-        if not path.startswith(OPENING_NOT_YET)
-        for p in places
+        f"{path}:{line}: {doc[:60]!r}"
+        for path, text in sources()
+        for line, doc in docstrings(text)
+        if OPENING.match(doc)
     ]
 
 
 def test_no_private_vocabulary() -> None:
     assert not [
-        p
-        for path, places in private_words().items()
-        if not path.startswith(WORDS_NOT_YET)
-        for p in places
+        f"{path}:{number}: {line.strip()[:80]}"
+        for path, text in sources()
+        for number, line in enumerate(text.splitlines(), 1)
+        if PRIVATE_WORDS.search(line)
     ]
-
-
-@pytest.mark.parametrize("prefix", OPENING_NOT_YET)
-def test_opening_exceptions_are_needed(prefix: str) -> None:
-    assert any(path.startswith(prefix) for path in bad_openings()), f"{prefix} is clean: remove it"
-
-
-@pytest.mark.parametrize("prefix", WORDS_NOT_YET)
-def test_word_exceptions_are_needed(prefix: str) -> None:
-    assert any(path.startswith(prefix) for path in private_words()), f"{prefix} is clean: remove it"
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from chronoscene.formats import writable_formats
 from chronoscene.methods import ProgramConfig, Runner, import_object
 
 VALUES = ("data", "output", "work", "iterations", "seconds", "seed")
-"""What a `Runner` may name besides the options of its config."""
+"""Values that a `Runner` may name besides the options of its config."""
 
 
 def used_values(runner: Runner, prefix: str) -> set[str]:

@@ -54,7 +54,7 @@ class Job:
     memory: int = 0
     """Bytes of memory that the run is expected to take."""
     commit: str = ""
-    """Of the code that runs it, which the worker asks for."""
+    """Commit of the code that runs it; set by the worker."""
     reports: bool = False
     """True if progress is sent to the bench, which runs several jobs at a time, and not shown."""
 

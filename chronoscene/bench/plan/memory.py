@@ -39,17 +39,17 @@ _MODEL = 10**9
 
 @dataclass(frozen=True, slots=True)
 class PhotoNeeds:
-    """What the photos of a scene take, all in bytes; without more words, those of the training."""
+    """Memory and disk space of the photos of a scene, in bytes; of training photos, if not said."""
 
     count: int
     total: int
-    """Of all photos at the evaluation size."""
+    """All photos at the evaluation size."""
     largest: int
-    """Of one of them."""
+    """One photo at the evaluation size."""
     decoding: int
-    """Of a file that is being decoded, at most."""
+    """A file while it is decoded, at most."""
     decoders: int
-    """How many are decoded at a time."""
+    """Number of photos decoded at a time."""
     allowed: int
     """In memory, those that are being decoded included."""
     on_disk: int
@@ -57,11 +57,11 @@ class PhotoNeeds:
     training: int
     """In memory besides the photos, without the model."""
     tests: int
-    """Of the images of all test views."""
+    """Images of all test views."""
 
     @property
     def in_memory(self) -> int:
-        """What they take of what is allowed."""
+        """Memory that they take within the limit."""
         return min(self.allowed, self.total + self.decoders * self.decoding)
 
     @property

@@ -1,4 +1,4 @@
-"""What a method may see under each strategy: training frame and training sets."""
+"""Training frame and training sets of a method under each strategy."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ class Part:
     test: tuple[Frame, ...]
     store: ImageStore
     hides_period: bool
-    """Whether the model is asked for period 0 whatever the view's period is."""
+    """True if the model renders period 0 for views of any period."""
     last: int
     """The last period whose images it was trained on."""
     extends: bool = False
-    """Whether the training begins with the model of the part before."""
+    """True if the training begins with the model of the part before."""
     ahead: tuple[Frame, ...] = ()
     """Test views of the period that the next stage learns."""
 
     @property
     def subfolder(self) -> str:
-        """Where its model is among those of the run; empty if it is the only one."""
+        """Folder of its model below the checkpoint; empty if it is the only one."""
         return "" if self.name == "all" else self.name
 
     def view(self, frame: Frame) -> View:
@@ -171,7 +171,7 @@ def _training_frames(scene: Scene, periods: range) -> tuple[Frame, ...]:
 
 
 def _seen(scene: Scene, periods: range) -> NDArray[np.bool_]:
-    """Whether a training image of a period sees the point; no image of other periods. [P, T]"""
+    """Return True where a training image of one of these periods sees the point. [P, T]"""
     counts = [f.split == "train" and f.period in periods for f in scene.frames]
     return scene.point_periods(np.array(counts))
 

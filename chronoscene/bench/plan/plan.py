@@ -1,4 +1,4 @@
-"""What a bench runs: every scene, method, strategy and seed that was asked for, checked first."""
+"""Plan of a bench: a checked run for each scene, method, strategy and seed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Plan:
 
     runs: dict[Path, ResolvedRun]
     todo: dict[Path, ResolvedRun]
-    """Those that had no result when the plan was made."""
+    """Runs without a result when the plan was made."""
 
 
 def plan_runs(settings: BenchSettings, log: Log) -> Plan:

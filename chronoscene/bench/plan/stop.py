@@ -30,7 +30,7 @@ def parse_duration(text: str, option: str = "--budget") -> float:
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """When a training ends: after some iterations, after a time, or whichever comes first."""
+    """End of a training: after some iterations, after a time, or whichever comes first."""
 
     iterations: int | None
     seconds: float | None

@@ -19,10 +19,10 @@ PATIENCE = 1.0  # Seconds from one look at the memory that is free to the next
 
 
 class Pool(Protocol):
-    """Where several jobs are executed at a time."""
+    """Place where several jobs are executed at a time."""
 
     at_once: int
-    """How many."""
+    """Number of jobs at a time."""
     stop: Stop
     """Ends all of them."""
 
@@ -30,18 +30,18 @@ class Pool(Protocol):
         """Run a job to its end, so that `Job.folder` is complete; called in a thread of its own.
 
         Args:
-            job: What to run.
+            job: The job.
             report: Called with its progress and notes, as `RunsDisplay` takes them.
 
         Returns:
-            Why it failed, if it did.
+            The failure, if it failed.
         """
         ...
 
 
 @contextmanager
 def open_pool(settings: BenchSettings) -> Iterator[Pool | None]:
-    """Where the settings say that runs are executed; None for one after the other, here.
+    """Open the pool of the settings; None for one run after the other, here.
 
     Raises:
         ConfigError: If there is no Ray, or no cluster.
@@ -80,12 +80,12 @@ class LocalPool:
     def _room(self, job: Job, report: Report) -> Iterator[None]:
         """Wait for the memory of a job, and keep it for the block."""
         with self._changed:
-            told = False
+            reported = False
             while self._taken and self._free() < job.memory:
-                if not told:
+                if not reported:
                     wanted = f"{job.memory / 1e9:.2f} GB"
                     report(f"{job.label}: waits until {wanted} of memory are free", 0, 0)
-                told = True
+                reported = True
                 self._changed.wait(PATIENCE)
                 self.stop.check()
             self._taken[job.label] = job.memory

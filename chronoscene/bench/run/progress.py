@@ -82,7 +82,7 @@ class RunsDisplay:
             self._say(line)
 
     def status(self, done: float) -> str:
-        """How far the runs are, in one line; ``done`` counts shares of those under way, too."""
+        """Describe the progress in one line; ``done`` counts shares of unfinished runs, too."""
         pieces = [f"{self._ended} of {self._total} runs", f"{len(self._shares)} under way"]
         seconds = time.monotonic() - self._began
         if done > KNOWN:

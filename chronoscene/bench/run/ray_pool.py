@@ -210,13 +210,13 @@ class RayPool:
         return self._ray.get(reference)
 
     def _on_gpu(self, job: Job) -> bool:
-        """Whether a job gets a GPU: where it is asked for, or could be used and there are some."""
+        """Return True if a job gets a GPU: one that asks for it, or can use it where one is."""
         if job.settings.device != "auto":
             return job.settings.device == "cuda"
         return "cuda" in load_spec(job.method).devices and any("GPU" in m for m in self._machines)
 
     def _reason(self, error: Exception) -> str:
-        """Why a run has no result."""
+        """Return the reason why a run has no result."""
         if isinstance(error, self._ray.exceptions.RayActorError):
             return f"the machine that ran it was lost, or its process there: {error}"
         cause = getattr(error, "cause", error)

@@ -36,12 +36,12 @@ Execute = Callable[[Job], records.Failure | None]
 
 @dataclass(frozen=True, slots=True)
 class BenchOutcome:
-    """What a bench did."""
+    """Outcome of a bench."""
 
     finished: tuple[Path, ...]
     """Folders of the runs of this bench that have a result, old or new."""
     skipped: int
-    """How many of them were there before."""
+    """Number of runs that were finished before."""
     failures: tuple[records.Failure, ...]
 
 
