@@ -18,9 +18,10 @@ from chronoscene import Scene, TrainedRun, open_run
 from chronoscene.bench.files.predictions import to_bytes
 from chronoscene.images.store import ImageStore
 from chronoscene.metrics.psnr_ssim import psnr
+from chronoscene.scene import Split
 
 
-def macro_psnr(run: TrainedRun, scene: Scene, split: str, every: int) -> float:
+def macro_psnr(run: TrainedRun, scene: Scene, split: Split, every: int) -> float:
     """Return the mean over periods of the mean PSNR over views of a split, in dB."""
     store = ImageStore(scene, max_width=run.record.max_width)
     values: dict[int, list[float]] = defaultdict(list)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -199,7 +198,3 @@ def _write(
 def _sexagesimal(degrees: float) -> tuple[float, float, float]:
     minutes = (degrees % 1) * 60
     return float(int(degrees)), float(int(minutes)), (minutes % 1) * 60
-
-
-if __name__ == "__main__":
-    sys.exit("run python -m benchmarks.registration.accuracy images")

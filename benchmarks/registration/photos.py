@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import csv
 import shutil
-import sys
 import time
 from pathlib import Path
 
@@ -156,7 +155,3 @@ def _frozen(
     options = shared.options_for(folder / "work-frozen", None)
     scene = read_scene(folder / "old")
     return run(read_captures(new), folder / "frozen", options, into=scene, inspected=found.append)
-
-
-if __name__ == "__main__":
-    sys.exit("run python -m benchmarks.registration.accuracy photos")

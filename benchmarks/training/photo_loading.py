@@ -42,7 +42,8 @@ from chronoscene.bench.plan.parts import Part, make_parts
 from chronoscene.bench.plan.plan import plan_runs
 from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.plan.stop import StopRule
-from chronoscene.bench.train.loop import forget_peak_memory, train
+from chronoscene.bench.train.loop import train
+from chronoscene.bench.train.warm_up import forget_peak_memory
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.formats import read_scene
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
