@@ -345,7 +345,7 @@ def footnotes(
             "in each period; seeds are averaged before, so their spread is not in it"
         )
     if entries.tied.any():
-        notes.append("†: at 95 %, views or seeds do not tell it from the best of its column")
+        notes.append("†: at 95 %, views or seeds do not separate it from the best of its column")
     for name, title in (("device", "device"), ("commit", "code")):
         values = dict.fromkeys(str(getattr(run, name)) for run in records)
         if values:
