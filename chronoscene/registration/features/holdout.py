@@ -120,32 +120,23 @@ def hold_out(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     count = round(arguments["share"] * len(candidates))
     chosen = np.sort(rng.choice(candidates, count, replace=False))
     removed = _filtered_copy(Path(arguments["database"]), Path(arguments["out"]), tracks, chosen)
-    _write_held_out(Path(arguments["held_out"]), tracks, chosen, removed, points, names)
+    _write_held_out(Path(arguments["held_out"]), tracks, removed, points, names)
     partners: dict[str, int] = dict.fromkeys(names.values(), 0)
-    for pair in matches:
-        for i in pair:
-            partners[names[i]] += 1
-    across = {f"{i}-{j}": n for (i, j), n in sorted(_cross_counts(matches, period_of).items())}
+    across: dict[tuple[int, int], list[int]] = {}
+    for (i, j), pairs in matches.items():
+        partners[names[i]] += 1
+        partners[names[j]] += 1
+        a, b = sorted((period_of[i], period_of[j]))
+        if a != b:
+            across.setdefault((a, b), []).append(len(pairs))
+    counts = {f"{a}-{b}": found for (a, b), found in sorted(across.items())}
     return {
         "tracks_of_several_periods": len(candidates),
         "held_out": int(removed.sum()),
         "partners": partners,
-        "verified_pairs_across": {k: v[0] for k, v in across.items()},
-        "matches_across": {k: v[1] for k, v in across.items()},
+        "verified_pairs_across": {key: len(found) for key, found in counts.items()},
+        "matches_across": {key: sum(found) for key, found in counts.items()},
     }
-
-
-def _cross_counts(
-    matches: Mapping[tuple[int, int], Ints], period_of: Mapping[int, int]
-) -> dict[tuple[int, int], tuple[int, int]]:
-    """Count pairs of images and their matches between every two periods."""
-    counts: dict[tuple[int, int], tuple[int, int]] = {}
-    for (i, j), pairs in matches.items():
-        a, b = sorted((period_of[i], period_of[j]))
-        if a != b:
-            n, m = counts.get((a, b), (0, 0))
-            counts[a, b] = (n + 1, m + len(pairs))
-    return counts
 
 
 def _filtered_copy(source: Path, target: Path, tracks: Tracks, chosen: Ints) -> Mask:
@@ -197,12 +188,7 @@ def _remove_journals(database: Path) -> None:
 
 
 def _write_held_out(
-    path: Path,
-    tracks: Tracks,
-    chosen: Ints,
-    held: Mask,
-    points: Mapping[int, Array],
-    names: Mapping[int, str],
+    path: Path, tracks: Tracks, held: Mask, points: Mapping[int, Array], names: Mapping[int, str]
 ) -> None:
     """Write the observations of held-out tracks: track, image and pixels."""
     mine = held[tracks.track] if len(held) else np.zeros(0, bool)

@@ -55,7 +55,7 @@ class Figure:
         return f"{number}{unit} ({self.interval[0]:.2g} to {self.interval[1]:.2g})"
 
 
-def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[Figure]:
+def period_figures(period: PeriodFigures) -> Iterator[Figure]:
     """Figures of one period."""
     photos = f"{period.photos} photos"
     yield Figure("registered images", period.registered, "", photos)
@@ -188,7 +188,7 @@ def to_json(
                     "registered": p.registered,
                     "photos": p.photos,
                     "reasons": dict(p.reasons),
-                    "figures": [asdict(f) for f in period_figures(certificate, p)],
+                    "figures": [asdict(f) for f in period_figures(p)],
                 }
                 for p in certificate.periods
             ],

@@ -56,7 +56,7 @@ def render_report(
         levels={"pass": "Pass", "doubtful": "Doubtful", "fail": "Fail", None: "Not linked"},
         colors=[COLORS[i % len(COLORS)] for i in range(len(certificate.labels))],
         map=camera_map(model) if model.names else None,
-        periods=[(p, list(period_figures(certificate, p))) for p in certificate.periods],
+        periods=[(p, list(period_figures(p))) for p in certificate.periods],
         pairs=[
             (_names(certificate, p), verdict.pairs.get((p.a, p.b)), pair_figures(certificate, p))
             for p in certificate.pairs

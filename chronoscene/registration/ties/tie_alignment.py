@@ -79,7 +79,7 @@ def align_with_tie_points(
         remarks.append(f"alignment replaced: tie points were off by {error:.1f} px (median)")
         model, more = _align_periods(model, clicks, tie_points)
         remarks += more
-    model, controlled, more = _to_control(model, clicks, control, tie_points)
+    model, controlled, more = _to_control(model, clicks, control)
     found = tuple(residuals(model, clicks, control if controlled else {}))
     named = [r.name for r in found if r.outlier]
     remarks += more + ([f"outliers: {', '.join(named)}"] if named else [])
@@ -163,7 +163,7 @@ def move_periods(model: Registered, moves: dict[int, Sim3]) -> Registered:
 
 
 def _to_control(
-    model: Registered, clicks: Clicks, control: dict[str, Array], tie_points: TiePoints
+    model: Registered, clicks: Clicks, control: dict[str, Array]
 ) -> tuple[Registered, bool, list[str]]:
     """Move the whole model to ground control, if there is enough of it."""
     if not control:

@@ -214,7 +214,7 @@ def test_json_has_units_numbers_and_reasons(certificate: Certificate) -> None:
         for figure in pair["figures"]:
             assert (figure["value"] is None) == bool(figure["absent"]), figure
     assert len(data["thresholds"]) == len(THRESHOLDS)
-    assert len(list(period_figures(certificate, certificate.periods[0]))) >= 6
+    assert len(list(period_figures(certificate.periods[0]))) >= 6
 
 
 @pytest.mark.parametrize("threshold", THRESHOLDS.values(), ids=lambda t: t.key)
