@@ -72,7 +72,7 @@ def share_of_other(
     The w that minimises the squared error of (1 - w) own + w other; errors at right angles to the
     change do not count. Of an image that is to show its own period, it is the *ghosting*. What it
     grows by when the other period is rendered is the *sensitivity* to the change: 1 for a model
-    that shows both right, 0 for one that cannot tell them apart.
+    that shows both right, 0 for one that cannot distinguish them.
 
     Args:
         image: [H, W, C]

@@ -129,14 +129,14 @@ def test_depth_changes_by_a_thousandth_of_the_larger_one() -> None:
 
 def test_edits_tell_every_difference(made, world) -> None:  # type: ignore[no-untyped-def]
     story = json.loads((made.folder / "gt/periods.json").read_text())
-    told = {(e["target"], e["period"]) for e in story["edits"]}
+    listed = {(e["target"], e["period"]) for e in story["edits"]}
     differ = set()
     for name, entry in story["objects"].items():
         states = {p: i for i, s in enumerate(entry["states"]) for p in s["periods"]}
         for p in range(1, made.scene.num_periods):
             if states.get(p - 1) != states.get(p):
                 differ.add((name, p))
-    assert told == differ and differ
+    assert listed == differ and differ
     assert {"add", "remove", "grow"} <= {e["action"] for e in story["edits"]}
 
 

@@ -8,6 +8,7 @@ the noise that indirect rays per pixel would have.
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -112,18 +113,8 @@ def make_lights(seed: int, periods: int, *, same: bool = False) -> list[Light]:
     return [lights[0]] * periods if same else lights
 
 
-class SkyArgs(NamedTuple):
-    """The values of a light that compiled code uses."""
-
-    direction: Array
-    sun: Array
-    zenith: Array
-    horizon: Array
-    cloud: float
-    haze: float
-    exposure: float
-    white: Array
-    sky_seed: int
+SkyArgs = namedtuple("SkyArgs", "direction sun zenith horizon cloud haze exposure white sky_seed")
+"""The values of a light that compiled code uses."""
 
 
 def sky_args(light: Light) -> SkyArgs:
