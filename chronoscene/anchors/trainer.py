@@ -21,7 +21,7 @@ from chronoscene.anchors.rounds import DensityControl, DrawnView
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.devices import to_device
-from chronoscene.training.drawing import camera_centre_tensor, draw, step_background
+from chronoscene.training.drawing import camera_centre_tensor, draw_in_training
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import BackwardPass, collect_gradients, mask_tensor
 from chronoscene.training.losses import mean_volume, training_loss
@@ -94,17 +94,8 @@ class AnchorTrainer:
         splats, positions = self.optimizer.seen(visible, row).decode_active(
             self._one_period, camera_centre_tensor(view, device), everything
         )
-        background = step_background(
-            self.background, config, seed=self.seed, number=self.sampler.drawn
-        )
-        raster = draw(
-            splats,
-            view,
-            background,
-            near_plane=config.near_plane,
-            antialiased=config.antialiased,
-            absgrad=config.absgrad,
-            check_finite=False,
+        raster = draw_in_training(
+            splats, view, self.background, config, seed=self.seed, number=self.sampler.drawn
         )
         loss = training_loss(
             raster, photo, mask, number=number, exposure=self.exposure, config=config

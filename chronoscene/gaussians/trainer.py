@@ -26,7 +26,7 @@ from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.devices import to_device
-from chronoscene.training.drawing import Splats, draw, step_background
+from chronoscene.training.drawing import Splats, draw_in_training
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import collect_gradients, mask_tensor
 from chronoscene.training.losses import training_loss
@@ -131,19 +131,9 @@ class GaussianTrainer:
         number = self.sampler.next()
         view = self.train.views[number]
         splats = self.splats(number)
-        config = self.config
-        background = step_background(
-            self.background, config, seed=self.seed, number=self.sampler.drawn
-        )
-        raster = draw(
-            splats,
-            view,
-            background,
-            near_plane=config.near_plane,
-            antialiased=config.antialiased,
-            absgrad=config.absgrad,
-            # A scale beyond all numbers shows in the gradients; one such step ends no training.
-            check_finite=False,
+        drawn = self.sampler.drawn
+        raster = draw_in_training(
+            splats, view, self.background, self.config, seed=self.seed, number=drawn
         )
         mask = mask_tensor(self.train, number, self.background.device)
         self.optimizer.zero_grad()

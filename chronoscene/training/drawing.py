@@ -102,6 +102,31 @@ def step_background(
     return to_device(generator.random(3, np.float32), background.device)
 
 
+def draw_in_training(
+    splats: Splats,
+    view: View,
+    background: Tensor,
+    config: SplattingConfig,
+    *,
+    seed: int,
+    number: int,
+) -> Rasterization:
+    """Draw a view in a training step, as the options ask for; arguments as `step_background`.
+
+    Both trainers draw by it: what a term of the loss needs, such as depth, is asked for here.
+    """
+    return draw(
+        splats,
+        view,
+        step_background(background, config, seed=seed, number=number),
+        near_plane=config.near_plane,
+        antialiased=config.antialiased,
+        absgrad=config.absgrad,
+        # A scale beyond all numbers shows in the gradients; one such step ends no training.
+        check_finite=False,
+    )
+
+
 def prediction_of(raster: Rasterization, exposure: Tensor | None = None) -> Prediction:
     """Make the prediction of a view that was drawn alone and with depth.
 

@@ -37,8 +37,8 @@ def training_loss(
 ) -> Tensor:
     """Compute the loss that all methods share, for one training view.
 
-    A term for all methods is added here, and its weight as an option of `SplattingConfig`. One of
-    the depth needs ``render_depth`` in both trainers' calls of `draw`.
+    A term for all methods is added here, and its weight as an option of `SplattingConfig`; a depth
+    to compare is asked for in `chronoscene.training.drawing.draw_in_training`.
 
     Args:
         raster: The view as it was drawn.
