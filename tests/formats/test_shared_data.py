@@ -27,7 +27,7 @@ BARE_MODELS = ("sceaux_txt", "shared_camera_8of_many", "t265_fisheye_txt")
 
 
 def test_no_folder_is_forgotten(shared_data):
-    known = {*READ, *IMAGES_ONLY, "colmap_models"}
+    known = {*READ, *IMAGES_ONLY, "colmap_models", "stone_bench"}
     assert {p.name for p in shared_data.iterdir() if p.is_dir()} <= known
 
 
