@@ -103,8 +103,5 @@ def _legend(figure: Any, names: Sequence[str], colors: Sequence[str], top: float
     """Draw the names of the periods above the panels; of many only some."""
     fitting = int((WIDTH - 0.3) / (0.45 + 0.075 * max(map(len, names))))
     step = -(-len(colors) // min(MAX_LEGEND_ENTRIES, max(fitting, 1)))
-    shown = range(0, len(colors), step)
-    entries = [(names[i], colors[i]) for i in shown]
-    canvas.add_legend(
-        figure, entries, loc="upper center", bbox_to_anchor=(0.5, top), ncol=len(shown)
-    )
+    entries = list(zip(names, colors, strict=True))[::step]
+    canvas.add_legend(figure, entries, len(entries), loc="upper center", bbox_to_anchor=(0.5, top))

@@ -96,13 +96,17 @@ def inline_svg(figure: Any, label: str, titles: Mapping[str, str]) -> Markup:
     ).format(width, height, label, Markup(body))
 
 
-def add_legend(figure: Any, entries: Sequence[tuple[str, str]], **place: Any) -> None:
-    """Add names beside squares of their colours; ``place`` is for `Figure.legend`."""
+def add_legend(figure: Any, entries: Sequence[tuple[str, str]], columns: int, **place: Any) -> None:
+    """Add names beside squares of their colours, line by line; ``place`` is for `Figure.legend`."""
     from matplotlib.patches import Patch
 
+    columns = min(columns, len(entries))
+    # Matplotlib fills legends column by column.
+    entries = [entry for column in range(columns) for entry in entries[column::columns]]
     figure.legend(
         [Patch(color=color) for _, color in entries],
         [plain(name) for name, _ in entries],
+        ncols=columns,
         borderaxespad=0,
         frameon=False,
         fontsize=9,

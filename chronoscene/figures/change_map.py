@@ -73,6 +73,6 @@ def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path) -> Non
     corner = (LEFT / width, 1 - 0.1 / height)
     entries = list(COLORS.items())
     canvas.add_legend(
-        figure, entries, loc="upper left", bbox_to_anchor=corner, ncol=len(entries), borderpad=0
+        figure, entries, len(entries), loc="upper left", bbox_to_anchor=corner, borderpad=0
     )
     canvas.save(figure, path)

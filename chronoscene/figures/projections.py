@@ -70,7 +70,10 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
             _draw_cameras(axes, cloud, box, plane, colors)
         label_axes(axes, plane, axis_names, size)
     _write_texts(figure, cloud, box, (x_right / width, (y_top - GAP) / height))
-    _draw_legend(figure, names, colors, columns, 1 - TITLE / height)
+    entries, corner = list(zip(names, colors, strict=True)), (LEFT / width, 1 - TITLE / height)
+    canvas.add_legend(
+        figure, entries, columns, loc="upper left", bbox_to_anchor=corner, borderpad=0
+    )
     canvas.save(figure, path)
 
 
@@ -192,16 +195,3 @@ def _write_texts(figure: Any, cloud: Cloud, box: Box, corner: tuple[float, float
         lines.insert(1, f"{outside:,} outside")
     at = corner[0], corner[1] - 0.42 / height
     figure.text(*at, "\n".join(lines), fontsize=8, va="top", color=canvas.GREY, linespacing=1.4)
-
-
-def _draw_legend(
-    figure: Any, names: Sequence[str], colors: Sequence[str], columns: int, top: float
-) -> None:
-    columns = min(columns, len(names))
-    # Legends are filled column by column; ours is read line by line.
-    order = [i for column in range(columns) for i in range(column, len(names), columns)]
-    entries = [(names[i], colors[i]) for i in order]
-    corner = (LEFT / figure.get_size_inches()[0], top)
-    canvas.add_legend(
-        figure, entries, loc="upper left", bbox_to_anchor=corner, ncol=columns, borderpad=0
-    )

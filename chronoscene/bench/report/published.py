@@ -56,21 +56,6 @@ class PublishedTable(BaseModel):
     inconsistencies: Mapping[str, str]
     """Contradictions in the paper, or with the files of its authors, by a short id."""
 
-    def mean(self, method: str, metric: str, *, group: str | None = None) -> float:
-        """Average a metric over the scenes of a group, or over all.
-
-        Raises:
-            KeyError: If no row matches.
-        """
-        values = [
-            getattr(row, metric)
-            for row in self.rows
-            if row.method == method and group in (None, row.group)
-        ]
-        if not values:
-            raise KeyError(f"{method} has no row in group {group}")
-        return sum(values) / len(values)
-
 
 def load_published(name: str = "chronogs_paper") -> PublishedTable:
     """Read a published table that is shipped with this package."""

@@ -137,7 +137,7 @@ def test_peak_memory_follows_allocations():
     del block
 
 
-def test_a_system_that_does_not_tell_its_memory(monkeypatch):
+def test_a_system_whose_memory_is_unknown(monkeypatch):
     monkeypatch.setattr(provenance, "Path", lambda place: Path("/absent"))
     monkeypatch.setitem(sys.modules, "resource", None)
     assert provenance.peak_memory_bytes() is None
