@@ -29,7 +29,6 @@ LEVELS: tuple[Level, ...] = ("pass", "doubtful", "fail")
 class Threshold:
     """One check: the limits beyond which a figure is doubtful, and beyond which it fails."""
 
-    key: str
     what: str
     unit: str = ""
     doubtful: float
@@ -55,133 +54,111 @@ _LOOK = f"look at the comparisons on the page (--report); if they jump, {_CLICK}
 _CONTROL = "give ground control: --tie-points with world coordinates"
 
 THRESHOLDS: dict[str, Threshold] = {
-    t.key: t
-    for t in (
-        Threshold(
-            key="registered",
-            what="share of the photos of a period that are registered",
-            doubtful=0.6, fail=0.1, larger_is_better=True,
-            why="measurements say little about a period most of whose photos are missing",
-            todo="registration_log.json says why photos are missing; add photos with viewpoints "
-            "between those of the dates",
-        ),
-        Threshold(
-            key="images",
-            what="registered images of a period",
-            unit="images", doubtful=5, fail=3, larger_is_better=True,
-            why="fewer images cannot place points by themselves, so nothing can be checked",
-            todo="add photos of this period",
-        ),
-        Threshold(
-            key="rotation",
-            what="remaining rotation between two periods",
-            unit="degrees", doubtful=0.1, fail=0.1,
-            why="0.1 degrees is 1.7 pixels at a focal length of 1000: twice the error of matching",
-            todo=_CLICK,
-        ),
-        Threshold(
-            key="shift",
-            what="remaining displacement between two periods",
-            unit="% of extent", doubtful=0.2, fail=0.2,
-            why="0.2% is 20 cm in 100 m: smaller changes cannot be distinguished from misalignment",
-            todo=_CLICK,
-        ),
-        Threshold(
-            key="held_out",
-            what="held-out tracks between two periods",
-            unit="tracks", doubtful=12, larger_is_better=True,
-            why="a similarity has seven unknowns and fits almost any smaller number of tracks",
-            todo=_CLICK,
-        ),
-        Threshold(
-            key="agreeing",
-            what="share of held-out observations that agree",
-            doubtful=0.75, fail=0.15, larger_is_better=True,
-            why="correct registrations reach 0.85 and more; with fewer, part of the matches or of "
-            "the poses is wrong, or matching is misled by repeated structure",
-            todo="look at the worst pair on the page (--report); remove its photos if they do not "
-            "fit",
-        ),
-        Threshold(
-            key="excess",
-            what="held-out residual beyond the noise of matching, as an angle",
-            unit="degrees", doubtful=0.1, fail=0.4,
-            why="errors that no similarity explains come from drift that deforms a period "
-            "(doming), or from a wrong camera",
-            todo="calibrate each date (--calibration per-period), or add oblique photos; "
-            "otherwise "
-            + _CONTROL,
-        ),
-        Threshold(
-            key="occupied",
-            what="share of the overlap of two periods that has tie points",
-            doubtful=0.15, larger_is_better=True,
-            why="matches in one spot can come from repeated structure, and say little about the "
-            "rest",
-            todo=_CLICK,
-        ),
-        Threshold(
-            key="tied",
-            what="share of the images of a period that see tie points",
-            doubtful=0.5, larger_is_better=True,
-            why="images without any are held by their own period alone",
-            todo=_CLICK,
-        ),
-        Threshold(
-            key="localised",
-            what="pose error of images localised from the other period, beyond its noise",
-            unit="times 0.1 degrees or 0.2%", doubtful=0.6, fail=10.0,
-            why="the points of each period must place the images of the other correctly",
-            todo=_LOOK,
-        ),
-        Threshold(
-            key="clouds",
-            what="shift between the surfaces of two periods, if its interval excludes 0",
-            unit="% of extent", doubtful=0.15,
-            why="surfaces are compared without matches, so repeated structure shows here; but a "
-            "beach or a quarry may really have moved",
-            todo=_LOOK,
-        ),
-        Threshold(
-            key="surfaces",
-            what="share of the surfaces beyond their level of detection",
-            doubtful=0.3,
-            why="correct registrations stay below 0.25 even where two thirds of the scene is new; "
-            "above, surfaces contradict the matches, as with repeated structure",
-            todo=_LOOK,
-        ),
-        Threshold(
-            key="gps_offset",
-            what="horizontal offset between the GPS of two periods, beyond its spread",
-            unit="m", doubtful=5.0, fail=15.0,
-            why="the bias of a receiver varies by up to about 3.5 m from day to day; heights vary "
-            "more, so they are not judged",
-            todo=f"if the GPS is reliable, {_CLICK}",
-        ),
-        Threshold(
-            key="gps_residual",
-            what="residual of a period's cameras to its own GPS, median",
-            unit="m", doubtful=12.0,
-            why="receivers err by 3 to 8 m; more means that part of the poses is wrong, or that "
-            "the view of the sky was obstructed",
-            todo="look at the map on the page (--report); register the period alone to see which "
-            "photos deform it",
-        ),
-        Threshold(
-            key="gps_scale",
-            what="scale of a period against its own GPS, beyond its spread",
-            unit="%", doubtful=2.0, fail=10.0,
-            why="GPS errs in position, hardly in scale",
-            todo=_CONTROL,
-        ),
-        Threshold(
-            key="gps_turn",
-            what="heading of a period against its own GPS, beyond its spread",
-            unit="degrees", doubtful=2.0, fail=10.0,
-            why="GPS errs in position, hardly in direction",
-            todo=_CONTROL,
-        ),
-    )
+    "registered": Threshold(
+        what="share of the photos of a period that are registered",
+        doubtful=0.6, fail=0.1, larger_is_better=True,
+        why="measurements say little about a period most of whose photos are missing",
+        todo="registration_log.json says why photos are missing; add photos with viewpoints "
+        "between those of the dates",
+    ),
+    "images": Threshold(
+        what="registered images of a period",
+        unit="images", doubtful=5, fail=3, larger_is_better=True,
+        why="fewer images cannot place points by themselves, so nothing can be checked",
+        todo="add photos of this period",
+    ),
+    "rotation": Threshold(
+        what="remaining rotation between two periods",
+        unit="degrees", doubtful=0.1, fail=0.1,
+        why="0.1 degrees is 1.7 pixels at a focal length of 1000: twice the error of matching",
+        todo=_CLICK,
+    ),
+    "shift": Threshold(
+        what="remaining displacement between two periods",
+        unit="% of extent", doubtful=0.2, fail=0.2,
+        why="0.2% is 20 cm in 100 m: smaller changes cannot be distinguished from misalignment",
+        todo=_CLICK,
+    ),
+    "held_out": Threshold(
+        what="held-out tracks between two periods",
+        unit="tracks", doubtful=12, larger_is_better=True,
+        why="a similarity has seven unknowns and fits almost any smaller number of tracks",
+        todo=_CLICK,
+    ),
+    "agreeing": Threshold(
+        what="share of held-out observations that agree",
+        doubtful=0.75, fail=0.15, larger_is_better=True,
+        why="correct registrations reach 0.85 and more; with fewer, part of the matches or of the "
+        "poses is wrong, or matching is misled by repeated structure",
+        todo="look at the worst pair on the page (--report); remove its photos if they do not fit",
+    ),
+    "excess": Threshold(
+        what="held-out residual beyond the noise of matching, as an angle",
+        unit="degrees", doubtful=0.1, fail=0.4,
+        why="errors that no similarity explains come from drift that deforms a period (doming), "
+        "or from a wrong camera",
+        todo="calibrate each date (--calibration per-period), or add oblique photos; otherwise "
+        + _CONTROL,
+    ),
+    "occupied": Threshold(
+        what="share of the overlap of two periods that has tie points",
+        doubtful=0.15, larger_is_better=True,
+        why="matches in one spot can come from repeated structure, and say little about the rest",
+        todo=_CLICK,
+    ),
+    "tied": Threshold(
+        what="share of the images of a period that see tie points",
+        doubtful=0.5, larger_is_better=True,
+        why="images without any are held by their own period alone",
+        todo=_CLICK,
+    ),
+    "localised": Threshold(
+        what="pose error of images localised from the other period, beyond its noise",
+        unit="times 0.1 degrees or 0.2%", doubtful=0.6, fail=10.0,
+        why="the points of each period must place the images of the other correctly",
+        todo=_LOOK,
+    ),
+    "clouds": Threshold(
+        what="shift between the surfaces of two periods, if its interval excludes 0",
+        unit="% of extent", doubtful=0.15,
+        why="surfaces are compared without matches, so repeated structure shows here; but a beach "
+        "or a quarry may really have moved",
+        todo=_LOOK,
+    ),
+    "surfaces": Threshold(
+        what="share of the surfaces beyond their level of detection",
+        doubtful=0.3,
+        why="correct registrations stay below 0.25 even where two thirds of the scene is new; "
+        "above, surfaces contradict the matches, as with repeated structure",
+        todo=_LOOK,
+    ),
+    "gps_offset": Threshold(
+        what="horizontal offset between the GPS of two periods, beyond its spread",
+        unit="m", doubtful=5.0, fail=15.0,
+        why="the bias of a receiver varies by up to about 3.5 m from day to day; heights vary "
+        "more, so they are not judged",
+        todo=f"if the GPS is reliable, {_CLICK}",
+    ),
+    "gps_residual": Threshold(
+        what="residual of a period's cameras to its own GPS, median",
+        unit="m", doubtful=12.0,
+        why="receivers err by 3 to 8 m; more means that part of the poses is wrong, or that the "
+        "view of the sky was obstructed",
+        todo="look at the map on the page (--report); register the period alone to see which "
+        "photos deform it",
+    ),
+    "gps_scale": Threshold(
+        what="scale of a period against its own GPS, beyond its spread",
+        unit="%", doubtful=2.0, fail=10.0,
+        why="GPS errs in position, hardly in scale",
+        todo=_CONTROL,
+    ),
+    "gps_turn": Threshold(
+        what="heading of a period against its own GPS, beyond its spread",
+        unit="degrees", doubtful=2.0, fail=10.0,
+        why="GPS errs in position, hardly in direction",
+        todo=_CONTROL,
+    ),
 }  # fmt: skip
 
 
@@ -325,10 +302,10 @@ def _localised(found: Localisation, extent: float) -> float:
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
     """Judge the alignment of two periods, and its uncertainty.
 
-    They are not if either interval lies beyond the limit. They are if the interval of the precise
-    measurement (all ties) ends below the limit, and the independent one (held-out tracks) agrees:
-    its interval ends below the limit, or its estimate lies below and its interval ends below twice
-    the limit.
+    They are misaligned if either interval lies beyond the limit. They are aligned if the interval
+    of the precise measurement (all ties) ends below the limit, and the independent one (held-out
+    tracks) agrees: its interval ends below the limit, or its estimate lies below it and its
+    interval ends below twice the limit.
     """
     held, by_all = pair.misalignment, pair.by_all
     if isinstance(held, str) or isinstance(by_all, str):
@@ -346,15 +323,12 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
         if low > limit:
             yield from _check(key, max(one.value, every.value) * factor, place)
         elif high > limit or (loose > limit and (estimate > limit or loose > 2 * limit)):
-            unit = THRESHOLDS[key].unit
-            bound = max(high, loose)
+            t = THRESHOLDS[key]
             found = (
-                f"{THRESHOLDS[key].what}: {estimate:.3g} {unit}, but up to {bound:.3g} cannot be "
+                f"{t.what}: {estimate:.3g} {t.unit}, but up to {max(high, loose):.3g} cannot be "
                 f"ruled out; expected at most {limit:g}"
             )
-            yield Objection(
-                "doubtful", key, place, found, THRESHOLDS[key].why, THRESHOLDS[key].todo
-            )
+            yield Objection("doubtful", key, place, found, t.why, t.todo)
 
 
 def _limit(key: str) -> float:

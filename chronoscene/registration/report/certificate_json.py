@@ -210,7 +210,7 @@ def to_json(
                 "remarks": ties.remarks,
                 "points": [asdict(r) for r in ties.residuals],
             },
-            "thresholds": [asdict(t) for t in THRESHOLDS.values()],
+            "thresholds": [{"key": key} | asdict(t) for key, t in THRESHOLDS.items()],
         }
     )
 

@@ -217,8 +217,9 @@ def test_json_has_units_numbers_and_reasons(certificate: Certificate) -> None:
     assert len(list(period_figures(certificate.periods[0]))) >= 6
 
 
-@pytest.mark.parametrize("threshold", THRESHOLDS.values(), ids=lambda t: t.key)
-def test_thresholds_are_in_order_and_explained(threshold: Any) -> None:
+@pytest.mark.parametrize("key", THRESHOLDS)
+def test_thresholds_are_in_order_and_explained(key: str) -> None:
+    threshold = THRESHOLDS[key]
     better = -1 if threshold.larger_is_better else 1
     assert threshold.level(threshold.doubtful) == "pass"
     assert threshold.level(threshold.doubtful + better * 1e-9) != "pass"
