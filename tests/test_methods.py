@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 
@@ -58,6 +58,17 @@ def test_tuples_are_written_as_in_python_or_json(value):
 def test_values_of_another_type_are_refused(value):
     with pytest.raises(ConfigError, match="toy --set iterations: expected a valid integer, found"):
         build_config(SPEC, preset="fast", overrides={"iterations": value})
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    iterations: "Sequence[int]" = ()  # noqa: F821
+
+
+def test_annotations_that_cannot_be_read_are_named():
+    spec = replace(SPEC, config=f"{__name__}:Unreadable")
+    with pytest.raises(ConfigError, match=r"Unreadable: .* found name 'Sequence' is not defined"):
+        build_config(spec, preset="balanced")
 
 
 def test_unknown_preset_and_key_name_the_known_ones():

@@ -20,7 +20,7 @@ from functools import cache
 from textwrap import dedent
 from typing import Any, ClassVar, Protocol, get_type_hints
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
@@ -94,10 +94,16 @@ def check_options(config: Options) -> None:
 @cache
 def _adapters(config_class: type[Options]) -> dict[str, TypeAdapter[Any]]:
     """Return what checks and reads each option, by its name."""
-    kinds = get_type_hints(config_class, include_extras=True)
-    return {
-        field.name: TypeAdapter(kinds[field.name]) for field in dataclasses.fields(config_class)
-    }
+    try:
+        kinds = get_type_hints(config_class, include_extras=True)
+        return {f.name: TypeAdapter(kinds[f.name]) for f in dataclasses.fields(config_class)}
+    except (NameError, PydanticUserError) as error:
+        raise ConfigError(
+            f"{config_class.__module__}.{config_class.__name__}",
+            expected="fields with types that pydantic can read",
+            found=str(error).splitlines()[0],
+            todo="annotate plain types, and import their names outside of TYPE_CHECKING",
+        ) from error
 
 
 def _parsed(place: str, value: object, adapter: TypeAdapter[Any]) -> Any:
