@@ -49,7 +49,7 @@ def draw_figures(
     """Draw the comparison and the error maps of every scene with runs; returns the files."""
     written = []
     for scene, found in by_scene(records).items():
-        columns = [column_of(record) for record in found]
+        methods = [shown_run(record) for record in found]
         truth = ground_truth_folder(runs, scene)
         labels = found[0].period_labels
         rows = chosen_views(truth, views_per_period)
@@ -57,7 +57,7 @@ def draw_figures(
             continue
         for errors, name in ((False, "comparison"), (True, "errors")):
             path = runs / FIGURES / f"{safe_name(scene)}_{name}.png"
-            _draw(path, scene, truth, rows, columns, labels, errors=errors)
+            _draw(path, scene, truth, rows, methods, labels, errors=errors)
             written.append(path)
     return written
 
@@ -87,7 +87,7 @@ def chosen_views(truth: Path, per_period: int) -> list[ImageEntry]:
     return chosen
 
 
-def column_of(record: RunRecord) -> ShownRun:
+def shown_run(record: RunRecord) -> ShownRun:
     """Read the list of predictions of a run."""
     predictions = record.folder / PREDICTIONS
     entries = {e.view: e for e in read_manifest(predictions).images}
@@ -99,7 +99,7 @@ def _draw(
     scene: str,
     truth: Path,
     rows: Sequence[ImageEntry],
-    columns: Sequence[ShownRun],
+    methods: Sequence[ShownRun],
     labels: dict[str, str],
     *,
     errors: bool,
@@ -108,13 +108,13 @@ def _draw(
     # Space for a caption under each image, the titles above and the colour bar below; the rest is
     # cut off when the figure is saved.
     lines = len(rows) if errors else 2 * len(rows)
-    size = (CELL_WIDTH * (1 + len(columns)), (CELL_WIDTH * aspect + 0.3) * lines + 1.2)
+    size = (CELL_WIDTH * (1 + len(methods)), (CELL_WIDTH * aspect + 0.3) * lines + 1.2)
     figure = canvas.new_figure(*size, layout="compressed", dpi=150)
-    axes: Any = figure.subplots(lines, 1 + len(columns), squeeze=False)
+    axes: Any = figure.subplots(lines, 1 + len(methods), squeeze=False)
     image = None
     for row, entry in zip(np.split(axes, len(rows)), rows, strict=True):
-        image = _draw_row(row, truth, entry, columns, labels, errors=errors)
-    for axis, title in zip(axes[0], ["ground truth", *(c.title for c in columns)], strict=True):
+        image = _draw_row(row, truth, entry, methods, labels, errors=errors)
+    for axis, title in zip(axes[0], ["ground truth", *(c.title for c in methods)], strict=True):
         axis.set_title(title, fontsize=10)
     if errors and image is not None:
         bar = figure.colorbar(
@@ -122,7 +122,7 @@ def _draw(
         )
         bar.set_label("mean absolute error, share of full scale", fontsize=9)
     what = "error of the test views" if errors else "test views"
-    where = "methods differ most" if len(columns) > 1 else "errors are largest"
+    where = "methods differ most" if len(methods) > 1 else "errors are largest"
     figure.suptitle(f"{scene}: {what}; framed: where {where}", fontsize=12)
     canvas.save(figure, path, bbox_inches="tight", pad_inches=0.1)
 
@@ -131,7 +131,7 @@ def _draw_row(
     axes: Any,
     truth: Path,
     entry: ImageEntry,
-    columns: Sequence[ShownRun],
+    methods: Sequence[ShownRun],
     labels: dict[str, str],
     *,
     errors: bool,
@@ -141,7 +141,7 @@ def _draw_row(
     ``axes`` has a second row for what is enlarged, or one row for error maps.
     """
     photo, mask = load_image(truth, entry), load_mask(truth, entry)
-    images = [load_image(column.folder, column.entries[entry.view]) for column in columns]
+    images = [load_image(run.folder, run.entries[entry.view]) for run in methods]
     maps = [mean_error(image, photo, mask) for image in images]
     window = where_methods_differ(maps)
     shown = None

@@ -17,8 +17,8 @@ from chronoscene.bench.report.comparison_figure import (
     ShownRun,
     by_scene,
     chosen_views,
-    column_of,
     psnr_text,
+    shown_run,
 )
 from chronoscene.bench.report.quality_curves import draw_curves
 from chronoscene.bench.report.summary import summarise
@@ -96,12 +96,12 @@ def _shown_views(
     runs: Path, found: dict[str, list[RunRecord]], max_bytes: int
 ) -> dict[str, list[ShownView]]:
     """Return views of each scene, as many of each period as fit."""
-    columns = {scene: [*map(column_of, of_scene)] for scene, of_scene in found.items()}
+    methods = {scene: [*map(shown_run, of_scene)] for scene, of_scene in found.items()}
 
     def draw(scene: str, per_period: int) -> Iterator[ShownView]:
         truth, labels = ground_truth_folder(runs, scene), found[scene][0].period_labels
         for entry in chosen_views(truth, per_period):
-            yield _shown_view(truth, entry, columns[scene], labels)
+            yield _shown_view(truth, entry, methods[scene], labels)
 
     # The first view of each period shows how many fit.
     size = sum(view.size for scene in found for view in draw(scene, 1))
@@ -116,14 +116,14 @@ def _shown_views(
 
 
 def _shown_view(
-    truth: Path, entry: ImageEntry, columns: Sequence[ShownRun], labels: dict[str, str]
+    truth: Path, entry: ImageEntry, methods: Sequence[ShownRun], labels: dict[str, str]
 ) -> ShownView:
     photo, mask = load_image(truth, entry), load_mask(truth, entry)
     predictions = []
-    for column in columns:
-        image = load_image(column.folder, column.entries[entry.view])
-        method = column.title.replace("\n", " (") + ")"
-        predictions.append((method, psnr_text(image, photo, mask), _picture(image)))
+    for run in methods:
+        image = load_image(run.folder, run.entries[entry.view])
+        name = run.title.replace("\n", " (") + ")"
+        predictions.append((name, psnr_text(image, photo, mask), _picture(image)))
     period = period_name(entry.camera_period, labels)
     return ShownView(entry.view, period, _picture(photo), tuple(predictions))
 
