@@ -28,10 +28,10 @@ __all__ = [
     "SceneReport",
     "Statistics",
     "TrainedRun",
-    "benchmark",
+    "bench",
     "open_run",
     "read_scene",
-    "statistics",
+    "stats",
     "validate",
 ]
 """The public interface, which `chronoscene.api` defines."""
@@ -48,10 +48,10 @@ if _typing.TYPE_CHECKING:
         SceneReport,
         Statistics,
         TrainedRun,
-        benchmark,
+        bench,
         open_run,
         read_scene,
-        statistics,
+        stats,
         validate,
     )
 else:

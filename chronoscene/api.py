@@ -11,25 +11,25 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from chronoscene.bench.files.records import ROWS_FILE, Failure
-from chronoscene.bench.files.strategies import STRATEGIES
-from chronoscene.bench.plan.settings import BenchSettings, RunSettings
-from chronoscene.bench.plan.stop import parse_duration
-from chronoscene.bench.report.summary import ENTRY_COLUMNS, read_with_rows, summarise
-from chronoscene.bench.run.runner import run_bench
-from chronoscene.bench.score.views import PredictedView
-from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.checks import check_choice
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import read_scene
+from chronoscene.harness.files.records import ROWS_FILE, Failure
+from chronoscene.harness.files.strategies import STRATEGIES
+from chronoscene.harness.plan.settings import BenchSettings, RunSettings
+from chronoscene.harness.plan.stop import parse_duration
+from chronoscene.harness.report.summary import ENTRY_COLUMNS, read_with_rows, summarise
+from chronoscene.harness.run.runner import run_bench
+from chronoscene.harness.score.views import PredictedView
+from chronoscene.harness.use.trained_run import TrainedRun, open_run
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.log import Log
 from chronoscene.kernels.runtime import check_device
 from chronoscene.methods import as_typed
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
-from chronoscene.stats.counts import COUNT_RULES, CountRule
-from chronoscene.stats.measures import measure_scene
+from chronoscene.statistics.counts import COUNT_RULES, CountRule
+from chronoscene.statistics.measures import measure_scene
 from chronoscene.validation.rule import SceneReport
 from chronoscene.validation.rules import choose_rules
 from chronoscene.validation.run import ReadOptions, find_folders, validate_scene
@@ -48,10 +48,10 @@ __all__ = [
     "SceneReport",
     "Statistics",
     "TrainedRun",
-    "benchmark",
+    "bench",
     "open_run",
     "read_scene",
-    "statistics",
+    "stats",
     "validate",
 ]
 
@@ -101,11 +101,11 @@ def validate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Statistics:
-    """Contents of a scene as pandas tables. Made by `statistics`."""
+    """Contents of a scene as pandas tables. Made by `stats`."""
 
     periods: DataFrame
     """One row per period: ``label``, ``date``, ``images``, ``train``, ``test``, ``points`` and the
-    fields of `chronoscene.stats.measures.Measures`. NaN or None if there is nothing to measure."""
+    fields of `chronoscene.statistics.measures.Measures`. NaN or None where nothing is measured."""
     whole: Series
     """The same quantities of the whole scene."""
     overlap: DataFrame
@@ -117,7 +117,7 @@ class Statistics:
     """Unit of the world: ``metre`` or ``unknown``."""
 
 
-def statistics(
+def stats(
     scene: Scene | str | Path,
     *,
     count: CountRule = "assigned",
@@ -138,7 +138,7 @@ def statistics(
         ConfigError: If an argument has an unknown value.
 
     Example:
-        >>> statistics("data/plaza").periods[["images", "points", "track_mean"]]
+        >>> stats("data/plaza").periods[["images", "points", "track_mean"]]
     """
     import pandas as pd
 
@@ -169,7 +169,7 @@ def _between(periods: DataFrame, shares: Sequence[Sequence[float | None]]) -> Da
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkResult:
-    """Finished and failed runs of `benchmark`."""
+    """Finished and failed runs of `bench`."""
 
     runs: tuple[Path, ...]
     """Folders of the finished runs, which `open_run` takes."""
@@ -184,7 +184,7 @@ class BenchmarkResult:
 
         Returns:
             One row per scene, method, quantity and column (``period 0``, ``macro``, ...);
-            `chronoscene.bench.report.summary.ENTRY_COLUMNS` describes the columns.
+            `chronoscene.harness.report.summary.ENTRY_COLUMNS` describes the columns.
         """
         records = [read_with_rows(folder) for folder in self.runs]
         return summarise(records, metrics)[[*ENTRY_COLUMNS]]
@@ -197,7 +197,7 @@ class BenchmarkResult:
         return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
-def benchmark(
+def bench(
     scenes: str | Path | Sequence[str | Path],
     methods: str | Sequence[str],
     *,
@@ -247,7 +247,7 @@ def benchmark(
             a run are in the result instead.
 
     Example:
-        >>> result = benchmark("data/plaza", ["chronogs", "3dgs"], out="runs", budget="90s")
+        >>> result = bench("data/plaza", ["chronogs", "3dgs"], out="runs", budget="90s")
         >>> result.table(["psnr"])
     """
     check_device(device)

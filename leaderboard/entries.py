@@ -15,11 +15,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from chronoscene.bench.files.records import RunRecord, ViewScore
-from chronoscene.bench.report.summary import COSTS
-from chronoscene.bench.score.regions import ALL
-from chronoscene.bench.score.scoring import aggregate
 from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import RunRecord, ViewScore
+from chronoscene.harness.report.summary import COSTS
+from chronoscene.harness.score.regions import ALL
+from chronoscene.harness.score.scoring import aggregate
 from chronoscene.io.staging import leads_out
 from chronoscene.metrics.registry import all_metrics
 

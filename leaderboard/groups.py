@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from chronoscene.bench.files.records import RunRecord
+from chronoscene.harness.files.records import RunRecord
 
 
 class Setting(NamedTuple):

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from chronoscene.bench.report.tradeoff import on_front
 from chronoscene.figures.fronts import Mark, Panel, panel_svg
+from chronoscene.harness.report.tradeoff import on_front
 from chronoscene.metrics.registry import metric_info
 
 LEAST_RATIO = 1.1

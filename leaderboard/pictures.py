@@ -8,10 +8,10 @@ from typing import Any
 
 from PIL import Image
 
-from chronoscene.bench.files.ground_truth import ground_truth_folder
-from chronoscene.bench.files.predictions import ImageEntry, load_image, read_manifest
-from chronoscene.bench.files.records import PREDICTIONS, read_run, run_folders
 from chronoscene.formats.shared.grouping import natural_key
+from chronoscene.harness.files.ground_truth import ground_truth_folder
+from chronoscene.harness.files.predictions import ImageEntry, load_image, read_manifest
+from chronoscene.harness.files.records import PREDICTIONS, read_run, run_folders
 from leaderboard.entries import EntryRun, MeasuredEntry
 
 VIEWS = 3

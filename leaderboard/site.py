@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from chronoscene.bench.files.command_line import command_line
-from chronoscene.bench.files.records import RunRecord
-from chronoscene.bench.report.published import PublishedTable
-from chronoscene.bench.report.summary import (
+from chronoscene.figures.canvas import period_colors
+from chronoscene.harness.files.command_line import command_line
+from chronoscene.harness.files.records import RunRecord
+from chronoscene.harness.report.published import PublishedTable
+from chronoscene.harness.report.summary import (
     PAPER_METRICS,
     SIZE,
     in_unit,
@@ -23,9 +24,8 @@ from chronoscene.bench.report.summary import (
     published_entries,
     summarise,
 )
-from chronoscene.bench.report.tables import period_title
-from chronoscene.bench.report.tradeoff import as_configurations
-from chronoscene.figures.canvas import period_colors
+from chronoscene.harness.report.tables import period_title
+from chronoscene.harness.report.tradeoff import as_configurations
 from chronoscene.io.pages import render_page
 from chronoscene.io.staging import staged_folder
 from chronoscene.methods import MethodSpec, installed_methods, load_spec

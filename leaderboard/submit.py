@@ -9,9 +9,15 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from chronoscene.bench.files.predictions import load_image, read_manifest
-from chronoscene.bench.files.records import PREDICTIONS, RUN_FILE, read_rows, read_run, run_folders
-from chronoscene.bench.score.regions import ALL
+from chronoscene.harness.files.predictions import load_image, read_manifest
+from chronoscene.harness.files.records import (
+    PREDICTIONS,
+    RUN_FILE,
+    read_rows,
+    read_run,
+    run_folders,
+)
+from chronoscene.harness.score.regions import ALL
 from chronoscene.io.staging import write_text_atomic
 from leaderboard.entries import (
     EntryRun,

@@ -5,10 +5,10 @@ from zlib import crc32
 
 import numpy as np
 
-from chronoscene.bench.files.ground_truth import ground_truth_folder
-from chronoscene.bench.files.predictions import ImageWriter
-from chronoscene.bench.files.records import PREDICTIONS, RunRecord, ViewScore, write_run
-from chronoscene.bench.score.scoring import aggregate
+from chronoscene.harness.files.ground_truth import ground_truth_folder
+from chronoscene.harness.files.predictions import ImageWriter
+from chronoscene.harness.files.records import PREDICTIONS, RunRecord, ViewScore, write_run
+from chronoscene.harness.score.scoring import aggregate
 
 
 def record(method="chronogs", seed=0, *, psnr=(20.0, 30.0), ssim=None, **changes):

@@ -111,12 +111,12 @@ def assert_views_are_those_that_were_scored(run, rows):
 
 
 def test_statistics_of_a_folder_and_of_a_scene(in_folder):
-    ours = cs.statistics("data/plaza", count="seen")
+    ours = cs.stats("data/plaza", count="seen")
     assert list(ours.periods.images) == [2, 2] and ours.whole["images"] == 4
     assert list(ours.periods.points) == list(ours.periods.points_seen)
     assert ours.overlap.shape == ours.in_view.shape == (2, 2)
     with pytest.raises(cs.ChronoSceneError, match="count: expected"):
-        cs.statistics(in_folder, count="all")
+        cs.stats(in_folder, count="all")
 
 
 def test_validate_wants_one_scene(in_folder):
@@ -147,5 +147,5 @@ def test_validate_wants_one_scene(in_folder):
 def test_benchmark_refuses_before_it_trains(in_folder, wrong, message):
     right = {"scenes": "data/plaza", "methods": "chronogs", "out": "runs"}
     with pytest.raises(cs.ChronoSceneError, match=message):
-        cs.benchmark(**right | wrong)
+        cs.bench(**right | wrong)
     assert not list(Path().glob("runs/plaza/*"))

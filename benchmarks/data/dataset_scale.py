@@ -26,7 +26,7 @@ from statistics import median
 
 import psutil
 
-from chronoscene.bench.files.provenance import processor_name
+from chronoscene.harness.files.provenance import processor_name
 
 SCENE = "Aerial3"
 """The scene with the most points: 800 images, 530,434 points."""

@@ -23,11 +23,11 @@ import numpy as np
 from baselines.cl_splats import SPEC
 from baselines.cl_splats.changes import change_mask, change_scores
 from baselines.cl_splats.method import CLSplats
-from chronoscene.bench.files.predictions import encode_png
-from chronoscene.bench.plan.parts import Part, make_parts
-from chronoscene.bench.plan.stop import StopRule
-from chronoscene.bench.train.loop import seed_everything
 from chronoscene.formats import read_scene
+from chronoscene.harness.files.predictions import encode_png
+from chronoscene.harness.plan.parts import Part, make_parts
+from chronoscene.harness.plan.stop import StopRule
+from chronoscene.harness.train.loop import seed_everything
 from chronoscene.images.store import MAX_WIDTH, ImageStore
 from chronoscene.images.truth import UNCHANGED, load_changes, truth_place
 from chronoscene.methods import build_config

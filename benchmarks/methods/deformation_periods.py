@@ -22,9 +22,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from chronoscene.bench.use.cameras import find_viewpoints
-from chronoscene.bench.use.rendering import render_viewpoints
-from chronoscene.bench.use.trained_run import open_run
+from chronoscene.harness.use.cameras import find_viewpoints
+from chronoscene.harness.use.rendering import render_viewpoints
+from chronoscene.harness.use.trained_run import open_run
 from chronoscene.metrics.psnr_ssim import psnr
 
 CELL = 2.0  # Inches per image

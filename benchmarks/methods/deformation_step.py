@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from benchmarks.training.generated import PROGRESS, make, training_set
-from chronoscene.bench.files.provenance import code_version, processor_name
+from chronoscene.harness.files.provenance import code_version, processor_name
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
 from chronoscene.methods import Method
 

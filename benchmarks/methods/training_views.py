@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene import Scene, TrainedRun, open_run
-from chronoscene.bench.files.predictions import to_bytes
+from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.images.store import ImageStore
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Split

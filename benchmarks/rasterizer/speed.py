@@ -35,7 +35,7 @@ from benchmarks.rasterizer.peers import (
     torch_tiles,
 )
 from benchmarks.rasterizer.scenes import SIZES, Scene, surfaces
-from chronoscene.bench.files.provenance import code_version, processor_name
+from chronoscene.harness.files.provenance import code_version, processor_name
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
 

@@ -238,7 +238,7 @@ def main() -> None:
     if sys.argv[1:2] == ["--worker"]:
         work(sys.argv[2:], sys.stdin)
         return
-    from chronoscene.bench.files.provenance import code_version, processor_name
+    from chronoscene.harness.files.provenance import code_version, processor_name
     from chronoscene.kernels.runtime import available_threads
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])

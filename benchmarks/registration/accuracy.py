@@ -31,7 +31,7 @@ from benchmarks.registration.generated import CaseSettings, generate_case
 from benchmarks.registration.images import run_images
 from benchmarks.registration.outcomes import REFUSED, Outcome, judged
 from benchmarks.registration.photos import run_photos
-from chronoscene.bench.files.provenance import processor_name
+from chronoscene.harness.files.provenance import processor_name
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import LEVELS, judge
 

@@ -33,10 +33,10 @@ from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.anchors.decode import HeadWeights
 from chronoscene.anchors.model import HEADS
-from chronoscene.bench.files.provenance import code_version, processor_name
-from chronoscene.bench.plan.parts import make_parts
-from chronoscene.bench.train.loop import render_bytes
 from chronoscene.formats import read_scene
+from chronoscene.harness.files.provenance import code_version, processor_name
+from chronoscene.harness.plan.parts import make_parts
+from chronoscene.harness.train.loop import render_bytes
 from chronoscene.images.store import ImageStore
 from chronoscene.kernels.matmul import product
 from chronoscene.metrics.psnr_ssim import psnr

@@ -19,7 +19,7 @@ from typing import Any
 import chronoscene  # noqa: F401
 
 # isort: split
-from chronoscene.bench.files.provenance import code_version, processor_name
+from chronoscene.harness.files.provenance import code_version, processor_name
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import load_spec, method_names
 

@@ -35,17 +35,17 @@ import chronoscene  # noqa: F401
 import numpy as np
 from PIL import Image
 
-from chronoscene.bench.files.provenance import code_version, peak_memory_bytes, processor_name
-from chronoscene.bench.files.records import PHOTOS
-from chronoscene.bench.plan.memory import open_store
-from chronoscene.bench.plan.parts import Part, make_parts
-from chronoscene.bench.plan.plan import plan_runs
-from chronoscene.bench.plan.settings import bench_settings
-from chronoscene.bench.plan.stop import StopRule
-from chronoscene.bench.train.loop import train
-from chronoscene.bench.train.warm_up import forget_peak_memory
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.formats import read_scene
+from chronoscene.harness.files.provenance import code_version, peak_memory_bytes, processor_name
+from chronoscene.harness.files.records import PHOTOS
+from chronoscene.harness.plan.memory import open_store
+from chronoscene.harness.plan.parts import Part, make_parts
+from chronoscene.harness.plan.plan import plan_runs
+from chronoscene.harness.plan.settings import bench_settings
+from chronoscene.harness.plan.stop import StopRule
+from chronoscene.harness.train.loop import train
+from chronoscene.harness.train.warm_up import forget_peak_memory
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
 from chronoscene.methods import Method, MethodSize, StepReport, TrainingSet, import_object
 from chronoscene.methods.interface import nothing_ahead

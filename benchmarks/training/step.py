@@ -50,12 +50,12 @@ from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.anchors.trainer import AnchorTrainer
-from chronoscene.bench.files.provenance import code_version, library_versions, processor_name
-from chronoscene.bench.plan.parts import Part, make_parts
 from chronoscene.formats import read_scene
 from chronoscene.gaussians import model as gaussian_model
 from chronoscene.gaussians import trainer as gaussian_trainer
 from chronoscene.gaussians.density import GradientStatistics
+from chronoscene.harness.files.provenance import code_version, library_versions, processor_name
+from chronoscene.harness.plan.parts import Part, make_parts
 from chronoscene.images.store import ImageStore
 from chronoscene.kernels.runtime import (
     available_threads,

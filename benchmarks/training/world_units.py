@@ -23,10 +23,10 @@ import numpy as np
 from chronogs import SPEC
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronoscene.bench.files.provenance import code_version, processor_name
-from chronoscene.bench.plan.parts import Part, make_parts
-from chronoscene.bench.train.loop import render_bytes, seed_everything
 from chronoscene.formats import read_scene
+from chronoscene.harness.files.provenance import code_version, processor_name
+from chronoscene.harness.plan.parts import Part, make_parts
+from chronoscene.harness.train.loop import render_bytes, seed_everything
 from chronoscene.images.store import ImageStore
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import build_config

@@ -1,6 +1,6 @@
 """Progress of long commands: one bar on a terminal, else a plain line for each step, on stderr.
 
-`chronoscene bench` has its own bar for trainings, `chronoscene.bench.train.progress`, which shows
+`chronoscene bench` has its own bar for trainings, `chronoscene.harness.train.progress`, which shows
 the loss and handles trainings that end by the clock.
 """
 

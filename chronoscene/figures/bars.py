@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.figures import canvas
-from chronoscene.stats.counts import PeriodCount, SceneCount, period_title
+from chronoscene.statistics.counts import PeriodCount, SceneCount, period_title
 
 BAR = 0.3  # Inches per scene
 WIDTH = 9.0

@@ -11,8 +11,8 @@ from chronoscene.arrays import Array
 from chronoscene.io.wording import printable
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.stats.counts import assign_points, period_name
-from chronoscene.stats.measures import robust_range
+from chronoscene.statistics.counts import assign_points, period_name
+from chronoscene.statistics.measures import robust_range
 
 MARGIN = 0.03  # Of the longest edge, on every side
 MIN_EDGE = 0.18  # Of the longest edge: a flat scene gets space above and below it

@@ -1,7 +1,7 @@
 """Tables as text for a terminal, Markdown, LaTeX and CSV; names are only text in each of them.
 
 A `Table` holds cells as they are read. It does not need pandas: importing pandas takes half as long
-as ``chronoscene stats`` on a scene, so only the tables of runs (`chronoscene.bench.report`) group
+as ``chronoscene stats`` on a scene, so only the tables of runs (`chronoscene.harness.report`) group
 and average with it.
 """
 

@@ -24,9 +24,9 @@ from baselines.gaussian_in_the_wild.networks import (
     start_networks,
 )
 from baselines.gaussian_in_the_wild.trainer import WildTrainer, central_views
-from chronoscene.bench.contract import tiny_training
-from chronoscene.bench.train import painted_balls
 from chronoscene.errors import ConfigError
+from chronoscene.harness.contract import tiny_training
+from chronoscene.harness.train import painted_balls
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, View, build_config
 from chronoscene.training.photometric import photometric_loss_reference

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from chronoscene import methods
-from chronoscene.bench.contract import CHECKS
+from chronoscene.harness.contract import CHECKS
 from chronoscene.scene.similarity import Sim3
 
 ROOT = Path(__file__).parents[2]

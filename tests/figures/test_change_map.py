@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.bench.use.changes import CLASSES
 from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
 from chronoscene.figures.cloud import Cloud
+from chronoscene.harness.use.changes import CLASSES
 
 
 @pytest.fixture

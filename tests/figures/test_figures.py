@@ -23,7 +23,7 @@ from chronoscene.figures.density_map import (
     shade,
 )
 from chronoscene.figures.projections import draw_cloud, legend_names, readable
-from chronoscene.stats.counts import PAPER_COUNTS, PeriodCount, SceneCount
+from chronoscene.statistics.counts import PAPER_COUNTS, PeriodCount, SceneCount
 
 
 def cloud_with(xyz: np.ndarray, period: np.ndarray, periods: int = 3) -> Cloud:

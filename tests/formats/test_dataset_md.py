@@ -8,7 +8,7 @@ import pytest
 
 from chronoscene.formats import FORMATS, read_scene, writable_formats
 from chronoscene.scene import Period, Scene, WorldFrame
-from chronoscene.stats.counts import assign_points
+from chronoscene.statistics.counts import assign_points
 
 PAGE = Path(__file__).parents[2] / "DATASET.md"
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from made_runs import write_scored
 
-from chronoscene.bench.report.published import load_published
 from chronoscene.errors import CheckpointError, SceneError
+from chronoscene.harness.report.published import load_published
 from leaderboard.entries import read_entries
 from leaderboard.site import write_site
 from leaderboard.submit import submit

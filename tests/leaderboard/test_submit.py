@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from chronoscene.bench.files.records import read_rows, read_run, write_run
 from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.harness.files.records import read_rows, read_run, write_run
 from leaderboard.entries import read_entries
 from leaderboard.submit import submit
 

@@ -8,9 +8,9 @@ import json
 import numpy as np
 import pytest
 
-from chronoscene.bench.contract import CHECKS
-from chronoscene.bench.contract.subject import PAUSE, NotApplicableError, Subject
-from chronoscene.bench.contract.tiny_training import STEPS
+from chronoscene.harness.contract import CHECKS
+from chronoscene.harness.contract.subject import PAUSE, NotApplicableError, Subject
+from chronoscene.harness.contract.tiny_training import STEPS
 from chronoscene.methods import method_names
 from chronoscene.training.photometric import _PhotometricLoss
 

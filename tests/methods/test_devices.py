@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from chronoscene.bench.contract import tiny_training
-from chronoscene.bench.train import painted_balls
 from chronoscene.errors import CheckpointError
+from chronoscene.harness.contract import tiny_training
+from chronoscene.harness.train import painted_balls
 from chronoscene.methods import (
     Method,
     MethodSpec,

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.bench.contract import tiny_training
-from chronoscene.bench.train import painted_balls
+from chronoscene.harness.contract import tiny_training
+from chronoscene.harness.train import painted_balls
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object, load_spec
 from chronoscene.training.views import downscale_view

@@ -1,6 +1,6 @@
 """Who sees a point, reprojection, and where rays meet, against what loops say; common view.
 
-`tests/stats/test_measures_in_view.py` has more of common view, by whole scenes.
+`tests/statistics/test_measures_in_view.py` has more of common view, by whole scenes.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 import pytest
 
-from chronoscene.bench.plan.parts import make_parts
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
+from chronoscene.harness.plan.parts import make_parts
 from chronoscene.images.store import ImageStore
 
 CAMERAS, IMAGES, POINTS = (f"sparse/0/{stem}.txt" for stem in ("cameras", "images", "points3D"))

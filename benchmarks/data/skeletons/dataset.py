@@ -24,7 +24,7 @@ from chronoscene.formats import chronoscene as scene_format
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, WorldFrame
 from chronoscene.scene.splits import TEST_EVERY, format_split_text
-from chronoscene.stats.counts import PAPER_COUNTS
+from chronoscene.statistics.counts import PAPER_COUNTS
 from chronoscene.synth.render.noise import rng_for
 
 Progress = Callable[[int, int, str], None]
@@ -79,7 +79,7 @@ def write_skeleton(
 
     Args:
         out: New or empty folder.
-        counts: Images and points of each period; `chronoscene.stats.count_scene` finds these.
+        counts: Images and points of each period; `chronoscene.statistics.count_scene` finds these.
         seed: Another seed is another place; equal arguments give equal bytes.
         size: Width and height of cameras and images in pixels.
 

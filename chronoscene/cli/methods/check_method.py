@@ -27,7 +27,7 @@ def check(name: str) -> None:
     NAME is an installed method, or module:SPEC. It is trained on generated images on the CPU, which
     takes about a minute. Each rule is printed on a line. Exit status: 1 if a rule was broken.
     """
-    from chronoscene.bench.contract import check_method
+    from chronoscene.harness.contract import check_method
 
     look_here_for([name])
     results = []

@@ -107,8 +107,8 @@ def describe_option(option: Option) -> str:
 
 def describe_cost(spec: MethodSpec, runs: Path) -> str:
     """Return the costs of finished runs; without any, the command that measures them."""
-    from chronoscene.bench.files.records import read_run, run_folders
-    from chronoscene.bench.report.tables import cost_tables
+    from chronoscene.harness.files.records import read_run, run_folders
+    from chronoscene.harness.report.tables import cost_tables
     from chronoscene.io.tables import plain_text
 
     records = [run for folder in run_folders(runs) if (run := read_run(folder)).method == spec.name]

@@ -6,10 +6,6 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.report.comparison_figure import draw_figures
-from chronoscene.bench.report.comparison_page import comparison_page
-from chronoscene.bench.report.single_views import view_scores, worst_views
-from chronoscene.bench.report.summary import read_runs
 from chronoscene.cli.options import EXISTING_FOLDER, FILE
 from chronoscene.cli.output import (
     A_FILE,
@@ -19,6 +15,10 @@ from chronoscene.cli.output import (
     terminal_width,
     writing_to,
 )
+from chronoscene.harness.report.comparison_figure import draw_figures
+from chronoscene.harness.report.comparison_page import comparison_page
+from chronoscene.harness.report.single_views import view_scores, worst_views
+from chronoscene.harness.report.summary import read_runs
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import boxed_text
 from chronoscene.metrics.registry import metric_info

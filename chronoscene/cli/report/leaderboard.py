@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.report.published import load_published
 from chronoscene.cli.options import EXISTING_FOLDER, FOLDER, RUNS
 from chronoscene.cli.output import check_place, report_written, writing_to
+from chronoscene.harness.report.published import load_published
 from leaderboard.entries import read_entries
 from leaderboard.site import write_site
 from leaderboard.submit import submit

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.files.records import RESULTS_FILE, ROWS_FILE
-from chronoscene.bench.report.comparison_figure import draw_figures
-from chronoscene.bench.report.published import load_published
-from chronoscene.bench.report.stage_figure import draw_stages
-from chronoscene.bench.report.summary import in_region, read_runs
-from chronoscene.bench.report.tables import MAX_PERIODS, format_runs
-from chronoscene.bench.score.regions import ALL, REGIONS, freeze_change_masks
-from chronoscene.bench.score.scoring import rescore
 from chronoscene.cli.options import EXISTING_FOLDER, LPIPS_WEIGHTS, RUNS, split_list
 from chronoscene.cli.output import FORMAT, OUT_FILE, emit, terminal_width
 from chronoscene.cli.progress import progress_bar
+from chronoscene.harness.files.records import RESULTS_FILE, ROWS_FILE
+from chronoscene.harness.report.comparison_figure import draw_figures
+from chronoscene.harness.report.published import load_published
+from chronoscene.harness.report.stage_figure import draw_stages
+from chronoscene.harness.report.summary import in_region, read_runs
+from chronoscene.harness.report.tables import MAX_PERIODS, format_runs
+from chronoscene.harness.score.regions import ALL, REGIONS, freeze_change_masks
+from chronoscene.harness.score.scoring import rescore
 from chronoscene.metrics.registry import METRICS, make_scorers, metric_info
 
 SOME_FAILED = 1  # Exit status when a run could not be scored

@@ -9,24 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from chronoscene.bench.files.records import FIGURES, Failure, RunRecord
-from chronoscene.bench.plan.stop import parse_duration
-from chronoscene.bench.report.summary import COSTS, read_runs, summarise
-from chronoscene.bench.report.tables import COST_TITLES, footnotes, tables_text
-from chronoscene.bench.report.time_to_quality import (
-    curve_values,
-    read_curve,
-    time_tables,
-    whole_curve,
-)
-from chronoscene.bench.report.tradeoff import (
-    FRONT_COLUMNS,
-    Limits,
-    as_configurations,
-    choose,
-    front_points,
-    front_tables,
-)
 from chronoscene.cli.options import FOLDER, RUNS
 from chronoscene.cli.output import (
     FORMAT,
@@ -37,6 +19,24 @@ from chronoscene.cli.output import (
     writing_to,
 )
 from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import FIGURES, Failure, RunRecord
+from chronoscene.harness.plan.stop import parse_duration
+from chronoscene.harness.report.summary import COSTS, read_runs, summarise
+from chronoscene.harness.report.tables import COST_TITLES, footnotes, tables_text
+from chronoscene.harness.report.time_to_quality import (
+    curve_values,
+    read_curve,
+    time_tables,
+    whole_curve,
+)
+from chronoscene.harness.report.tradeoff import (
+    FRONT_COLUMNS,
+    Limits,
+    as_configurations,
+    choose,
+    front_points,
+    front_tables,
+)
 from chronoscene.metrics.registry import metric_info
 
 if TYPE_CHECKING:

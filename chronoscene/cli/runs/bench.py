@@ -7,17 +7,6 @@ from typing import Any
 
 import click
 
-from chronoscene.bench.files.records import read_failures
-from chronoscene.bench.files.strategies import STRATEGIES
-from chronoscene.bench.plan.settings import (
-    PHOTO_DISK,
-    PHOTO_MEMORY,
-    SHARING,
-    BenchSettings,
-    bench_settings,
-)
-from chronoscene.bench.plan.stop import parse_duration
-from chronoscene.bench.run.runner import BenchOutcome, run_bench
 from chronoscene.checks import check_choice
 from chronoscene.cli.options import (
     FOLDER,
@@ -31,6 +20,17 @@ from chronoscene.cli.options import (
 )
 from chronoscene.cli.output import check_place
 from chronoscene.cli.report.results import print_runs
+from chronoscene.harness.files.records import read_failures
+from chronoscene.harness.files.strategies import STRATEGIES
+from chronoscene.harness.plan.settings import (
+    PHOTO_DISK,
+    PHOTO_MEMORY,
+    SHARING,
+    BenchSettings,
+    bench_settings,
+)
+from chronoscene.harness.plan.stop import parse_duration
+from chronoscene.harness.run.runner import BenchOutcome, run_bench
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
 from chronoscene.kernels.runtime import check_device

@@ -9,9 +9,6 @@ from pathlib import Path
 import click
 import numpy as np
 
-from chronoscene.bench.use.change_scores import changes_csv, changes_table, map_run
-from chronoscene.bench.use.changes import ChangeMap
-from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.cli.options import DEVICE, PATH, RUN, SCENE
 from chronoscene.cli.output import emit, report_written, terminal_width
 from chronoscene.cli.progress import tracked
@@ -20,6 +17,9 @@ from chronoscene.figures.canvas import rgb_of
 from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
 from chronoscene.figures.cloud import cloud_of
 from chronoscene.formats.shared.ply import write_vertices
+from chronoscene.harness.use.change_scores import changes_csv, changes_table, map_run
+from chronoscene.harness.use.changes import ChangeMap
+from chronoscene.harness.use.trained_run import TrainedRun, open_run
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import boxed_text
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.files.records import read_run
-from chronoscene.bench.use.compression import compress_run
-from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli.options import DEVICE, RUN, SCENE
 from chronoscene.cli.output import emit, report_written
 from chronoscene.cli.progress import announce
+from chronoscene.harness.files.records import read_run
+from chronoscene.harness.use.compression import compress_run
+from chronoscene.harness.use.trained_run import open_run
 
 
 @click.command("compress")

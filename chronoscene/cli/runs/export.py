@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.use.export import measure_loss
-from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli.options import DEVICE, FILE, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, emit, report_written
 from chronoscene.cli.progress import announce
 from chronoscene.formats.shared.gaussian_ply import write_gaussians
+from chronoscene.harness.use.export import measure_loss
+from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted
 

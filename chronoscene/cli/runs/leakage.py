@@ -7,13 +7,13 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.files.records import ROW_COLUMNS
-from chronoscene.bench.use.leakage import COLUMNS, leakage_table, measure_leakage
-from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli.options import DEVICE, EXISTING_FOLDER, RUN, SCENE
 from chronoscene.cli.output import OUT_FILE, check_file, emit, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import ROW_COLUMNS
+from chronoscene.harness.use.leakage import COLUMNS, leakage_table, measure_leakage
+from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io import tables
 
 

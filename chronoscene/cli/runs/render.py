@@ -7,18 +7,18 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.use.cameras import VIEWS, find_viewpoints, with_periods
-from chronoscene.bench.use.rendering import (
+from chronoscene.cli.options import DEVICE, PATH, RUN, SCENE, STAGE
+from chronoscene.cli.output import check_file, check_place, report_written
+from chronoscene.cli.progress import tracked
+from chronoscene.errors import ConfigError
+from chronoscene.harness.use.cameras import VIEWS, find_viewpoints, with_periods
+from chronoscene.harness.use.rendering import (
     check_viewpoints,
     is_animation,
     render_viewpoints,
     write_pictures,
 )
-from chronoscene.bench.use.trained_run import open_run
-from chronoscene.cli.options import DEVICE, PATH, RUN, SCENE, STAGE
-from chronoscene.cli.output import check_file, check_place, report_written
-from chronoscene.cli.progress import tracked
-from chronoscene.errors import ConfigError
+from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside
 
 

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.files.records import write_summary
-from chronoscene.bench.score.images import score_images
 from chronoscene.cli.options import (
     EXISTING_FILE,
     EXISTING_FOLDER,
@@ -20,6 +18,8 @@ from chronoscene.cli.output import check_place
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.report.results import print_runs
 from chronoscene.formats import read_scene
+from chronoscene.harness.files.records import write_summary
+from chronoscene.harness.score.images import score_images
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
 from chronoscene.metrics.registry import make_scorers

@@ -6,8 +6,6 @@ from typing import Any
 
 import click
 
-from chronoscene.bench.study.plan import find_study, read_study, run_study
-from chronoscene.bench.study.tables import study_texts
 from chronoscene.cli.options import (
     FOLDER,
     LPIPS_WEIGHTS,
@@ -18,6 +16,8 @@ from chronoscene.cli.options import (
 )
 from chronoscene.cli.output import emit, terminal_width
 from chronoscene.cli.runs.bench import SOME_FAILED, settings_from
+from chronoscene.harness.study.plan import find_study, read_study, run_study
+from chronoscene.harness.study.tables import study_texts
 
 ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 

@@ -28,7 +28,7 @@ from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import printable
 from chronoscene.kernels.runtime import keep_freed_memory
-from chronoscene.stats.counts import (
+from chronoscene.statistics.counts import (
     COUNT_RULES,
     CountRule,
     SceneCount,
@@ -38,8 +38,8 @@ from chronoscene.stats.counts import (
     in_paper_order,
     published,
 )
-from chronoscene.stats.details import format_details
-from chronoscene.stats.measures import SceneStatistics, measure_scene
+from chronoscene.statistics.details import format_details
+from chronoscene.statistics.measures import SceneStatistics, measure_scene
 
 Layout = Literal["full", "paper"]
 FIGURE_FORMATS = ("png", "pdf", "svg")

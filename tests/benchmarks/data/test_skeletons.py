@@ -14,7 +14,7 @@ from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.decoding import load_rgb
 from chronoscene.scene import Scene
-from chronoscene.stats.counts import PAPER_COUNTS, count_scene
+from chronoscene.statistics.counts import PAPER_COUNTS, count_scene
 from chronoscene.validation.run import validate_scene
 
 COUNTS = [(20, 700), (9, 300), (31, 1100)]

@@ -7,10 +7,10 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from chronoscene.bench.contract import RuleResult
 from chronoscene.cli import cli
 from chronoscene.cli.methods.check_method import SKELETON
 from chronoscene.errors import ConfigError, SceneError
+from chronoscene.harness.contract import RuleResult
 
 
 def run(*arguments):
@@ -75,7 +75,7 @@ def test_rules_are_told_line_by_line(monkeypatch):
         yield RuleResult("It resumes", left_out="the method cannot be resumed")
         yield RuleResult("It saves", problem="save: expected two files, found one")
 
-    monkeypatch.setattr("chronoscene.bench.contract.check_method", findings)
+    monkeypatch.setattr("chronoscene.harness.contract.check_method", findings)
     result = run("check-method", "mine")
     assert result.exit_code == 1
     assert result.stdout.splitlines() == [

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from chronoscene.cli import cli
 from chronoscene.methods import load_spec, method_names, options_of
 
-PLUGINS = Path(__file__).parents[2] / "bench" / "plugins"
+PLUGINS = Path(__file__).parents[2] / "harness" / "plugins"
 
 
 def methods(*arguments):

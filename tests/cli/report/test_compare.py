@@ -7,11 +7,11 @@ import pytest
 from click.testing import CliRunner
 from made_runs import scored
 
-from chronoscene.bench.files.ground_truth import ground_truth_folder
-from chronoscene.bench.files.predictions import ImageWriter
-from chronoscene.bench.files.records import PREDICTIONS, write_run
 from chronoscene.cli import cli
 from chronoscene.errors import ChronoSceneError
+from chronoscene.harness.files.ground_truth import ground_truth_folder
+from chronoscene.harness.files.predictions import ImageWriter
+from chronoscene.harness.files.records import PREDICTIONS, write_run
 
 
 @pytest.fixture

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 import chronoscene.cli.report.results as results_module
-from chronoscene.bench.files.records import RunRecord, read_run, run_folders, write_run
-from chronoscene.bench.score.scoring import Rescored
 from chronoscene.cli import cli
 from chronoscene.cli.options import split_list
 from chronoscene.errors import CheckpointError, ConfigError, MetricUnavailableError
+from chronoscene.harness.files.records import RunRecord, read_run, run_folders, write_run
+from chronoscene.harness.score.scoring import Rescored
 from chronoscene.metrics.registry import Scorers
 
 

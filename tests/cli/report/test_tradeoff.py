@@ -8,10 +8,10 @@ import pytest
 from click.testing import CliRunner
 from made_runs import record
 
-from chronoscene.bench.files.records import write_run
 from chronoscene.cli import cli
 from chronoscene.cli.report.tradeoff import parse_size
 from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import write_run
 from chronoscene.io.tables import FORMATS
 
 CURVE = "seconds,iteration,primitives,psnr,parameters,model\n2,1,1,10,1,all\n8,2,1,20,1,all\n"

@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 import chronoscene.cli.runs.bench as bench_module
-from chronoscene.bench.files.records import Failure
-from chronoscene.bench.run.runner import BenchOutcome
 from chronoscene.cli import cli
 from chronoscene.errors import BackendError, ConfigError
+from chronoscene.harness.files.records import Failure
+from chronoscene.harness.run.runner import BenchOutcome
 
-PLUGINS = Path(__file__).parents[2] / "bench" / "plugins"
+PLUGINS = Path(__file__).parents[2] / "harness" / "plugins"
 IMAGES = {f"{folder}/{i}.png": period for period, folder in enumerate("ab") for i in range(3)}
 TESTS = ["a/1.png", "b/1.png"]
 
@@ -113,7 +113,8 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
     make_scene_folder, tmp_path, monkeypatch, set_gsplat
 ):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    monkeypatch.setattr("chronoscene.bench.plan.plan.read_scene", lambda path: pytest.fail("read"))
+    reader = "chronoscene.harness.plan.plan.read_scene"
+    monkeypatch.setattr(reader, lambda path: pytest.fail("read"))
     command = ["bench", str(make_scene_folder()), "--method", "3dgs", "--out", str(tmp_path / "r")]
     result = CliRunner().invoke(cli, [*command, "--device", "cuda"])
     assert isinstance(result.exception, BackendError)

@@ -18,7 +18,7 @@ from chronoscene.cli import cli
 from chronoscene.cli.scenes.stats import against_paper
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
-from chronoscene.stats.counts import PAPER_COUNTS, PeriodCount, SceneCount
+from chronoscene.statistics.counts import PAPER_COUNTS, PeriodCount, SceneCount
 
 
 def run(*args: object):

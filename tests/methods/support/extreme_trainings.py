@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench.plan.parts import Part, effective_strategy, make_parts
-from chronoscene.bench.plan.stop import StopRule
-from chronoscene.bench.train import painted_balls
-from chronoscene.bench.train.loop import render_bytes, train
 from chronoscene.errors import ChronoSceneError
+from chronoscene.harness.plan.parts import Part, effective_strategy, make_parts
+from chronoscene.harness.plan.stop import StopRule
+from chronoscene.harness.train import painted_balls
+from chronoscene.harness.train.loop import render_bytes, train
 from chronoscene.methods import Method, MethodSpec, StepReport, build_config, import_object
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Camera, Frame, Period, Points, Scene

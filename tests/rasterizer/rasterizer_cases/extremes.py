@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.bench.plan.parts import training_frame
+from chronoscene.harness.plan.parts import training_frame
 from chronoscene.scene.geometry import quaternion_from_rotation, rotation_from_quaternion
 
 from .scenes import SmallScene, random_scene

@@ -1,0 +1,109 @@
+"""Rules for rendering."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.harness.contract.subject import NotApplicableError, Subject, demand, resized
+from chronoscene.harness.train.checks import check_prediction
+from chronoscene.methods import Prediction, View
+
+
+def any_size_renders(subject: Subject) -> None:
+    """Images of any size are rendered, with values 0 to 1."""
+    for size in ((1, 1), (17, 9), (40, 30), (101, 77)):
+        view = resized(subject.data.views[0], *size)
+        prediction = subject.loaded().render(view, 0.0)
+        place = f"{size[0]} x {size[1]} pixels"
+        check_prediction(prediction, view, place)
+        rgb = prediction.rgb
+        demand(
+            rgb.min() >= 0 and rgb.max() <= 1, f"{place}: Prediction.rgb", "values 0 to 1",
+            f"{rgb.min():.4g} to {rgb.max():.4g}",
+        )  # fmt: skip
+
+
+def a_larger_image_shows_the_same(subject: Subject) -> None:
+    """Twice the size, averaged, gives nearly the same image: K is obeyed."""
+    view = subject.data.views[1]
+    small = subject.method.render(view, 0.0).rgb
+    large = subject.method.render(resized(view, 2 * view.width, 2 * view.height), 0.0).rgb
+    averaged = large.reshape(view.height, 2, view.width, 2, 3).mean(axis=(1, 3))
+    difference = np.abs(averaged - small).mean()
+    demand(difference < 0.05, "Prediction.rgb at twice the size", "the same image", difference)
+
+
+def declared_outputs_are_there(subject: Subject) -> None:
+    """Alpha and depth are there where the spec names them, and mean what they should."""
+    view = subject.data.views[0]
+    prediction = subject.method.render(view, 0.0)
+    check_prediction(prediction, view, "render")
+    for field in ("alpha", "depth"):
+        value = getattr(prediction, field)
+        if field in subject.spec.outputs:
+            place = f"Prediction.{field}"
+            demand(value is not None, place, "an array, as MethodSpec.outputs names it", "None")
+            demand(value.min() >= 0, place, "nothing below 0", value.min())
+    if prediction.alpha is not None:
+        most = prediction.alpha.max()
+        demand(0.5 < most <= 1, "Prediction.alpha", "0 to 1, and more than 0.5 somewhere", most)
+    if prediction.depth is not None:
+        _check_depth(prediction, view)
+
+
+def _check_depth(prediction: Prediction, view: View) -> None:
+    assert prediction.depth is not None
+    # The balls lie within 0.7 of the origin, and the camera at distance 1 from it.
+    middle = prediction.depth[view.height // 2, view.width // 2]
+    demand(0.2 < middle < 1.8, "Prediction.depth", "z in units of the training frame", middle)
+    if prediction.alpha is not None:
+        behind = prediction.depth[prediction.alpha == 0]
+        demand((behind == 0).all(), "Prediction.depth", "0 where alpha is 0")
+
+
+def a_view_of_nothing_is_background(subject: Subject) -> None:
+    """A view of nothing shows the background."""
+    view = subject.data.views[0]
+    away = view.cam_from_world.copy()
+    away[:3, 3] += [0.0, 0.0, -50.0]  # everything far behind
+    rgb = subject.method.render(View(view.K, view.width, view.height, away), 0.0).rgb
+    far = float(np.abs(rgb - subject.data.background).max())
+    demand(far <= 1e-6, "Prediction.rgb of a view of nothing", "the background", f"{far:.3g} off")
+
+
+def periods_matter(subject: Subject) -> None:
+    """Periods that differ are rendered differently, where the method takes a period."""
+    if subject.spec.period_input == "none":
+        raise NotApplicableError("the method takes no period")
+    images = [_image(subject, float(period)) for period in range(3)]
+    for a, b in ((0, 1), (1, 2)):
+        change = np.abs(images[a] - images[b]).mean()
+        demand(change > 1e-4, f"render at periods {a} and {b}", "different images", change)
+
+
+def fractional_periods_lie_between(subject: Subject) -> None:
+    """Fractional periods lie between the whole ones, where the spec says continuous."""
+    if subject.spec.period_input != "continuous":
+        raise NotApplicableError("the method takes whole periods only")
+    first, half, second = (_image(subject, period) for period in (0.0, 0.5, 1.0))
+    demand(np.isfinite(half).all() and half.min() >= 0 and half.max() <= 1, "period 0.5", "0 to 1")
+    for other, period in ((first, 0), (second, 1)):
+        change = np.abs(half - other).mean()
+        demand(change > 1e-5, "render at period 0.5", f"another image than at {period}", change)
+    change = np.abs(_image(subject, 1e-4) - first).mean()
+    demand(change < 0.01, "render at period 0.0001", "nearly the image of period 0", change)
+
+
+def _image(subject: Subject, period: float) -> NDArray[np.float32]:
+    return subject.method.render(subject.data.views[0], period).rgb
+
+
+CHECKS = (
+    any_size_renders,
+    a_larger_image_shows_the_same,
+    declared_outputs_are_there,
+    a_view_of_nothing_is_background,
+    periods_matter,
+    fractional_periods_lie_between,
+)

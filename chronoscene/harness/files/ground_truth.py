@@ -1,0 +1,70 @@
+"""Ground truth of the test views, frozen once for all runs of a folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.predictions import ImageWriter, Manifest, read_manifest, safe_name
+from chronoscene.harness.files.records import GROUND_TRUTH
+from chronoscene.images.store import ImageStore
+from chronoscene.io.staging import needing_space, partial_name
+from chronoscene.scene import Scene
+
+
+def ground_truth_folder(runs: Path, scene: str) -> Path:
+    """Return the folder of the ground truth of a scene."""
+    return runs / GROUND_TRUTH / safe_name(scene)
+
+
+def freeze_ground_truth(
+    runs: Path, scene: Scene, scene_hash: str, store: ImageStore, max_width: int
+) -> Manifest:
+    """Write the test photos once; later calls only check that scene and size are the same.
+
+    Raises:
+        ConfigError: If the folder of runs holds another scene of this name, or another size.
+    """
+    folder = ground_truth_folder(runs, scene.name)
+    details = {"max_width": max_width}
+    if not folder.exists():
+        _write_ground_truth(folder, scene, scene_hash, store, details)
+    manifest = read_manifest(folder)
+    if manifest.scene_hash != scene_hash:
+        raise _conflict(folder, "the same scene", "another scene of this name, or other photos")
+    if manifest.details.get("max_width") != max_width:
+        found = f"--max-width {manifest.details.get('max_width')}"
+        raise _conflict(folder, f"--max-width {max_width}", found)
+    return manifest
+
+
+def _write_ground_truth(
+    folder: Path, scene: Scene, scene_hash: str, store: ImageStore, details: dict[str, int]
+) -> None:
+    partial = folder.with_name(partial_name(folder.name))
+    try:
+        with needing_space(folder):
+            writer = ImageWriter(partial)
+            for frame in scene.select(split="test"):
+                writer.add(
+                    frame.name,
+                    store.load(frame),
+                    camera_period=frame.period,
+                    rendered_period=frame.period,
+                    mask=store.load_mask(frame),
+                )
+            writer.close(
+                kind="ground truth", scene=scene.name, scene_hash=scene_hash, details=details
+            )
+        if not folder.exists():  # another bench may have written it meanwhile
+            os.replace(partial, folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _conflict(folder: Path, expected: str, found: str) -> ConfigError:
+    return ConfigError(
+        folder, expected=expected, found=found, todo="choose another folder with --out"
+    )

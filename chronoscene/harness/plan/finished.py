@@ -1,0 +1,126 @@
+"""Runs that are there already: finished, unfinished, or made with other settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files import records
+from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun
+
+
+def is_finished(run: ResolvedRun, overwrite: bool = False) -> bool:
+    """Return True if the result is there, made with the same settings from the same scene.
+
+    Raises:
+        ConfigError: If there is one made with other settings, unless it may be replaced.
+    """
+    if not (run.job.folder / records.RUN_FILE).is_file():
+        return False
+    return _matches(run, run.job.folder, "a finished", overwrite)
+
+
+def is_obsolete(run: ResolvedRun, overwrite: bool = False) -> bool:
+    """Return True for checkpoints of a training with other settings, which may be deleted.
+
+    Raises:
+        ConfigError: If there are such, and they may not be deleted.
+    """
+    if not (run.job.training / records.CONFIG_FILE).is_file():
+        return False
+    return not _matches(run, run.job.training, "an unfinished", overwrite)
+
+
+def is_to_do(run: ResolvedRun, overwrite: bool) -> bool:
+    """Return True if a run is neither finished nor in conflict with what is there.
+
+    Raises:
+        ConfigError: If a result or checkpoints with other settings are there and may not be
+            replaced.
+    """
+    if is_finished(run, overwrite):
+        return False
+    is_obsolete(run, overwrite)
+    return True
+
+
+def _matches(run: ResolvedRun, folder: Path, kind: str, overwrite: bool) -> bool:
+    if folder == run.job.folder:
+        records.read_run(folder)  # raises if it is damaged
+    stored = records.read_config(folder)
+    if stored == run.document or overwrite:
+        return bool(stored == run.document)
+    old, new = first_difference(stored, run.document)
+    raise ConfigError(
+        folder,
+        expected=f"a run with {new}",
+        found=f"{kind} one with {old}",
+        todo="choose another folder with --out, or pass --overwrite",
+    )
+
+
+def first_difference(old: Any, new: Any, key: str = "settings") -> tuple[str, str]:
+    """Return the first difference of two documents, as ``key value`` of both."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in [*new, *(k for k in old if k not in new)]:
+            if old.get(name) != new.get(name):
+                return first_difference(old.get(name), new.get(name), name)
+    return f"{key} {old}", f"{key} {new}"
+
+
+def continued(run: ResolvedRun, method: ResolvedMethod, iterations: int) -> ResolvedRun:
+    """Return the run that trains a finished one further: the longest there is.
+
+    Args:
+        run: With the settings of the finished run, apart from the number of iterations.
+        method: Its method.
+        iterations: Of the whole training.
+
+    Raises:
+        ConfigError: If there is no such run, or nothing to train further or to go on from.
+    """
+    there = {done.config.iterations: done for done in _other_lengths(run, method)}
+    shorter = [length for length in there if length <= iterations]
+    if not shorter:
+        raise ConfigError(
+            run.job.folder,
+            expected=f"a finished run that ended after at most {iterations} iterations",
+            found=f"one with {min(there)}" if there else "none",
+            todo="correct --continue-to, or train anew with --iterations",
+        )
+    last = there[max(shorter)]
+    is_finished(last)  # raises if its settings are others
+    if last.config.iterations == iterations:
+        return last
+    if not (last.job.folder / records.TRAINING).is_dir():
+        raise ConfigError(
+            last.job.folder,
+            expected="a run that kept its training",
+            found="its model alone",
+            todo="train anew with --keep-training; such a run can be trained further",
+        )
+    job = replace(
+        run.job.with_settings(iterations=iterations),
+        continued_from=[*last.job.continued_from, max(shorter)],
+        continues=str(last.job.folder),
+    )
+    return method.run(job)
+
+
+def _other_lengths(run: ResolvedRun, method: ResolvedMethod) -> Iterator[ResolvedRun]:
+    """Finished runs like this apart from the number of iterations, those begun afresh first."""
+    found, folder = [], run.job.folder
+    for file in sorted(folder.parent.parent.glob(f"*/{folder.name}/{records.RUN_FILE}")):
+        config = records.read_config(file.parent)["config"]
+        length = config.get("stop", {}).get("iterations")  # images of other programs have none
+        if length is None:
+            continue
+        earlier = config.get("continued_from", [])
+        job = replace(run.job.with_settings(iterations=length), continued_from=earlier)
+        other = method.run(job)
+        if other.job.folder == file.parent:
+            found.append(other)
+    yield from sorted(found, key=lambda done: len(done.job.continued_from))

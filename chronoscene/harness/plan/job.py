@@ -1,0 +1,127 @@
+"""A job is one run as data, which the bench passes to a worker process as JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from textwrap import shorten
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from chronoscene.harness.files.predictions import safe_name
+from chronoscene.harness.files.provenance import config_hash
+from chronoscene.harness.files.records import SOURCE_FILE, Failure
+from chronoscene.harness.files.source import RunSource
+from chronoscene.harness.plan.settings import RunSettings
+from chronoscene.io.staging import write_text_atomic
+from chronoscene.scene.similarity import Sim3
+
+LOCKS = ".locks"  # Folder beside the results, with a file for each run
+
+LONGEST_NAME = 180  # Characters; file systems allow 255 bytes, and special ones become longer
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One run. Paths are absolute."""
+
+    scene_root: str
+    scene_format: str
+    """Name in `chronoscene.formats`."""
+    scene: str
+    scene_hash: str
+    split_hash: str
+    method: str
+    """Argument of `load_spec`: a name or ``module:SPEC``."""
+    method_name: str
+    strategy: str
+    seed: int
+    settings: RunSettings
+    """The overrides are those of this method."""
+    notices: list[str] = field(default_factory=list)
+    staging: str = ""
+    """Folder that the worker writes; renamed to `folder` when it has ended."""
+    continued_from: list[int] = field(default_factory=list)
+    """Iterations of the shorter trainings that this one began with."""
+    continues: str = ""
+    """Folder of the last of them."""
+    variant: str = ""
+    """Differences from the preset, in words."""
+    plugin_path: str | None = None
+    """Folder from which ``module:SPEC`` may be imported."""
+    memory: int = 0
+    """Bytes of memory that the run is expected to take."""
+    commit: str = ""
+    """Commit of the code that runs it; set by the worker."""
+    reports: bool = False
+    """True if progress is sent to the bench, which runs several jobs at a time, and not shown."""
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any]) -> Job:
+        """Read what `document` gave."""
+        return _adapter().validate_python(document)
+
+    def document(self) -> dict[str, Any]:
+        """Return the job as plain data for JSON."""
+        document: dict[str, Any] = _adapter().dump_python(self, mode="json")
+        return document
+
+    def with_settings(self, **changes: Any) -> Job:
+        """Return the job with other values of some of its `RunSettings`."""
+        return replace(self, settings=replace(self.settings, **changes))
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the finished run."""
+        name = "-".join(filter(None, (*self._names, self.variant)))
+        if len(name) > LONGEST_NAME:
+            name = f"{name[:LONGEST_NAME]}-{config_hash({'variant': self.variant})[:8]}"
+        folder = safe_name(name).replace("/", "%2F")
+        return self.settings.runs / safe_name(self.scene) / folder / f"seed{self.seed}"
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return self.method_name, self.strategy, self.settings.preset
+
+    @property
+    def training(self) -> Path:
+        """Folder of the checkpoints of the training while the run is not finished."""
+        return self.folder.with_name(f".{self.folder.name}.training")
+
+    @property
+    def label(self) -> str:
+        """The run in words."""
+        names = " ".join(filter(None, (*self._names, self.variant)))
+        return f"{self.scene}: {names} seed {self.seed}"
+
+    def failure(self, reason: str) -> Failure:
+        """Return the record of a run that has no result; the reason becomes one line."""
+        return Failure(
+            method=self.method_name,
+            strategy=self.strategy,
+            preset=self.settings.preset,
+            variant=self.variant,
+            scene=self.scene,
+            seed=self.seed,
+            reason=shorten(reason, 500, placeholder=" ..."),
+        )
+
+    def write_source(self, training_from_world: Sim3) -> None:
+        """Write ``source.json`` of the run into its staging folder."""
+        source = RunSource(
+            method=self.method,
+            plugin_path=self.plugin_path,
+            scene_root=self.scene_root,
+            scene_format=self.scene_format,
+            period_by=self.settings.period_by,
+            training_from_world=training_from_world.to_matrix().tolist(),
+        )
+        path = Path(self.staging) / SOURCE_FILE
+        write_text_atomic(path, source.model_dump_json(indent=1) + "\n")
+
+
+@cache
+def _adapter() -> TypeAdapter[Job]:
+    return TypeAdapter(Job)

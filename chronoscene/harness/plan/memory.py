@@ -1,0 +1,192 @@
+"""Training photos of a run: the memory and disk that they take, and how they are loaded.
+
+Photos that do not all fit into the memory that they may take are decoded once and kept on disk,
+from where they are read ahead of the training.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from chronoscene.errors import ConfigError
+from chronoscene.formats import read_scene
+from chronoscene.harness.files.records import PHOTOS
+from chronoscene.harness.plan.job import Job
+from chronoscene.harness.plan.settings import RunSettings
+from chronoscene.images.disk_cache import DiskCache, files_of
+from chronoscene.images.store import ImageStore
+from chronoscene.io.wording import counted
+from chronoscene.kernels.runtime import available_threads, machine_memory
+from chronoscene.scene import Frame, Scene
+
+_DECODING = 20
+"""Bytes per pixel of a file while it is decoded: 10 for plain colours, 15 with a mask file, 20 for
+16 bits and for transparency (measured, Pillow 13)."""
+
+_AT_HAND = 3  # Photos that memory must hold: one in use, two ahead
+
+_LIBRARIES = 500 * 10**6  # Bytes of a training's process before it has a model
+_STEP = 250
+"""Bytes per pixel of a photo that a training step takes for images and their gradients (3DGS with
+few Gaussians, measured)."""
+_MODEL = 10**9
+"""Bytes of a model in training. Values, gradients and two moments of half a million Gaussians with
+59 numbers each take 0.47 GB, and as much again is for what is made of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoNeeds:
+    """Memory and disk space of the photos of a scene, in bytes; of training photos, if not said."""
+
+    count: int
+    total: int
+    """All photos at the evaluation size."""
+    largest: int
+    """One photo at the evaluation size."""
+    decoding: int
+    """A file while it is decoded, at most."""
+    decoders: int
+    """Number of photos decoded at a time."""
+    allowed: int
+    """In memory, those that are being decoded included."""
+    on_disk: int
+    """0 if all fit into memory."""
+    training: int
+    """In memory besides the photos, without the model."""
+    tests: int
+    """Images of all test views."""
+
+    @property
+    def in_memory(self) -> int:
+        """Memory that they take within the limit."""
+        return min(self.allowed, self.total + self.decoders * self.decoding)
+
+    @property
+    def of_run(self) -> int:
+        """Memory that a run takes, with a model of half a million Gaussians."""
+        return self.in_memory + self.training + _MODEL
+
+
+def photo_needs(scene: Scene, sizes: ImageStore, settings: RunSettings) -> PhotoNeeds:
+    """Return what the photos of a run take, in the sizes of a store of them."""
+    frames = scene.select(split="train")
+    photos = [sizes.bytes_of(frame) for frame in frames]
+    total, largest = sum(photos), max(photos)
+    # With two copies of the result: as it is decoded, and as it goes into memory.
+    decoding = _DECODING * max(_pixels(frame) for frame in frames) + 2 * largest
+    # Files that are being decoded take half of the memory, or there is one at a time.
+    threads = settings.threads or available_threads()
+    decoders = max(1, min(max(2, threads // 2), settings.photo_memory // (2 * decoding)))
+    fits = total + decoders * decoding <= settings.photo_memory
+    return PhotoNeeds(
+        count=len(photos),
+        total=total,
+        largest=largest,
+        decoding=decoding,
+        decoders=decoders,
+        allowed=settings.photo_memory,
+        on_disk=0 if fits else min(total, settings.photo_disk),
+        training=_LIBRARIES + _STEP * max(math.prod(sizes.camera(f).size) for f in frames),
+        tests=sum(sizes.bytes_of(frame) for frame in scene.select(split="test")),
+    )
+
+
+def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
+    """Open the photos of a run, within its limits."""
+    sizes = ImageStore(scene, max_width=settings.max_width)
+    needs = photo_needs(scene, sizes, settings)
+    disk = DiskCache(settings.runs / PHOTOS, settings.photo_disk) if needs.on_disk else None
+    return ImageStore(
+        scene,
+        max_width=settings.max_width,
+        memory_limit=needs.allowed - needs.decoders * needs.decoding,
+        decoders=needs.decoders,
+        disk=disk,
+    )
+
+
+def read_scene_of(job: Job) -> Scene:
+    """Read the scene of a job."""
+    rule = job.settings.period_by
+    return read_scene(Path(job.scene_root), format=job.scene_format, period_by=rule)
+
+
+def check_room(
+    scene: Scene, needs: PhotoNeeds, folder: Path, runs: int, *, here: bool = True
+) -> str:
+    """Check that memory and disk have room for the photos of a scene.
+
+    Args:
+        scene: What is trained on.
+        needs: Of its runs.
+        folder: Of all runs.
+        runs: How many runs are to be done.
+        here: True if this machine does them, so that its memory counts.
+
+    Returns:
+        What they take, in a line for the user.
+
+    Raises:
+        ConfigError: If they have not; the message says which setting would do.
+    """
+    _check_memory(scene, needs, machine_memory()[1] if here else None)
+    _check_disk(folder, needs, (1 + runs) * needs.tests)
+    photos = f"{counted(needs.count, 'training photo')}, {_gb(needs.total)} when decoded"
+    kept = f", {_gb(needs.on_disk)} on disk" if needs.on_disk else ""
+    return (
+        f"{scene.name}: {photos}: {_gb(needs.in_memory)} in memory{kept}; a training takes "
+        f"{_gb(needs.training)} and its model besides"
+    )
+
+
+def _check_memory(scene: Scene, needs: PhotoNeeds, free: int | None) -> None:
+    least = needs.decoding + _AT_HAND * needs.largest
+    if needs.allowed < least:
+        width, height = max((f.camera.size for f in scene.select(split="train")), key=math.prod)
+        raise ConfigError(
+            f"{scene.name}: --photo-memory",
+            expected=f"at least {_gb(least)} to decode photos of {width} x {height} pixels",
+            found=_gb(needs.allowed),
+            todo=f"use --photo-memory {math.ceil(least / 1e7) / 100}",
+        )
+    wanted = needs.in_memory + needs.training
+    if free is not None and free < wanted:
+        smaller = math.floor((free - needs.training) / 1e7) / 100
+        raise ConfigError(
+            scene.name,
+            expected=f"{_gb(wanted)} of memory, {_gb(needs.in_memory)} of it for photos",
+            found=f"{_gb(free)} free",
+            todo=f"use --photo-memory {smaller}"
+            if smaller * 1e9 >= least
+            else "end other programs, or use a machine with more memory",
+        )
+
+
+def _check_disk(runs: Path, needs: PhotoNeeds, images: int) -> None:
+    """Check that decoded photos, and test images of this many bytes, have room."""
+    folder = runs
+    kept = sum(stat.st_size for stat in files_of(folder / PHOTOS).values())
+    while not folder.exists():
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free + kept
+    if free < needs.on_disk + images:
+        smaller = max(0.0, math.floor((free - images) / 1e7) / 100)
+        raise ConfigError(
+            f"--out {runs}",
+            expected=f"room for {_gb(needs.on_disk)} of decoded photos and at most {_gb(images)} "
+            "of test images",
+            found=f"{_gb(free)} free",
+            todo="choose a place on another disk, or make room there"
+            + (f", or use --photo-disk {smaller}" if needs.on_disk else ""),
+        )
+
+
+def _pixels(frame: Frame) -> int:
+    return math.prod(frame.camera.size)
+
+
+def _gb(size: int) -> str:
+    return f"{size / 1e9:.2f} GB"

@@ -1,0 +1,233 @@
+"""Training frame and training sets of a method under each strategy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import SceneError
+from chronoscene.harness.files.strategies import STRATEGIES, period_part
+from chronoscene.images.store import ImageStore
+from chronoscene.methods import MethodSpec, TrainingSet, TrainingView, View
+from chronoscene.scene import Frame, Scene
+from chronoscene.scene.cameras import PINHOLE_MODELS
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import Sim3
+
+EXTENT_MARGIN = 1.1  # Factor of 3DGS between the farthest camera and the camera extent
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A model to train, or a stage of its training, and the test views that it answers for."""
+
+    name: str
+    """``all``, or that of `period_part`."""
+    train: TrainingSet
+    test: tuple[Frame, ...]
+    store: ImageStore
+    hides_period: bool
+    """True if the model renders period 0 for views of any period."""
+    last: int
+    """The last period whose images it was trained on."""
+    extends: bool = False
+    """True if the training begins with the model of the part before."""
+    ahead: tuple[Frame, ...] = ()
+    """Test views of the period that the next stage learns."""
+
+    @property
+    def subfolder(self) -> str:
+        """Folder of its model below the checkpoint; empty if it is the only one."""
+        return "" if self.name == "all" else self.name
+
+    def view(self, frame: Frame) -> View:
+        """The camera of a frame at the evaluation size, in the training frame."""
+        camera = self.store.camera(frame)
+        pose = self.train.training_from_world.apply_to_pose(frame.cam_from_world)
+        return View(camera.K, camera.width, camera.height, pose)
+
+    def method_period(self, frame: Frame) -> float:
+        """The period to ask the model for to predict a frame."""
+        return 0.0 if self.hides_period else float(self.shown_period(frame))
+
+    def shown_period(self, frame: Frame) -> int:
+        """The period that a prediction of a frame shows: its own, or the last that is known."""
+        return min(frame.period, self.last)
+
+
+def effective_strategy(spec: MethodSpec, strategy: str) -> tuple[str, str | None]:
+    """The strategy that a method can follow, and a notice where it is not the one asked for."""
+    check_choice("--strategy", strategy, STRATEGIES)
+    kind = STRATEGIES[strategy]
+    if kind.gives_period and not kind.period_is_input(spec) and not kind.in_order:
+        notice = f"{spec.name} takes no period: {strategy} is run and recorded as pooled"
+        return "pooled", notice
+    return strategy, None
+
+
+def make_parts(
+    scene: Scene, store: ImageStore, strategy: str, *, takes_period: bool = True
+) -> tuple[Part, ...]:
+    """The training sets of a strategy, in the order of the trainings.
+
+    The training frame comes from all training cameras of the scene, so that learning rates and
+    voxel sizes mean the same length whatever the strategy. Under ``sequential`` it comes from those
+    of the first period, as no others are known when the training begins.
+
+    Args:
+        scene: What is trained on.
+        store: Its images.
+        strategy: One of `STRATEGIES`.
+        takes_period: Whether the method takes the period.
+
+    Raises:
+        SceneError: If a camera is distorted, or images or points are missing that are needed.
+    """
+    check_choice("--strategy", strategy, STRATEGIES)
+    check_scene(scene)
+    kind = STRATEGIES[strategy]
+    hide, everything = not (kind.gives_period and takes_period), range(scene.num_periods)
+    to_training = training_frame(scene, everything[:1] if kind.in_order else everything)
+    if not kind.model_per_period and not kind.in_order:
+        train = _training_set(scene, store, to_training, everything, everything, hide_period=hide)
+        return (Part("all", train, scene.select(split="test"), store, hide, everything[-1]),)
+    parts = []
+    for period in everything:
+        own = everything[period : period + 1]
+        known = everything[: period + 1] if kind.in_order else own
+        train = _training_set(scene, store, to_training, own, known, hide_period=hide)
+        test = tuple(f for f in scene.select(split="test") if f.period in known)
+        part = Part(period_part(period), train, test, store, hide, period)
+        if kind.in_order:
+            ahead = scene.select(split="test", period=period + 1)
+            part = replace(part, extends=period > 0, ahead=ahead)
+        parts.append(part)
+    return tuple(parts)
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse scenes that no method can be trained on.
+
+    Raises:
+        SceneError: If a camera is distorted, or there is no training image.
+    """
+    for frame in scene.frames:
+        if not frame.camera.is_pinhole:
+            raise SceneError(
+                f"{scene.root}: {frame.name}",
+                expected=f"a camera without distortion ({', '.join(PINHOLE_MODELS)}, or "
+                "another model whose distortion parameters are all zero)",
+                found=frame.camera.model,
+                todo=f"run 'chronoscene undistort {scene.root} OUT' and use OUT",
+            )
+    if not scene.select(split="train"):
+        raise SceneError(
+            scene.root,
+            expected="at least one train image",
+            found=f"none ({scene.split_rule})",
+            todo=f"hold out whole periods (chronoscene split {scene.root} --scene-out NEW "
+            "--strategy periods --period ID), and use NEW",
+        )
+
+
+def training_frame(scene: Scene, periods: range | None = None) -> Sim3:
+    """``training_from_world``: mean training camera at the origin, the farthest at distance 1.
+
+    Where all cameras stand at one place, the median distance of the points becomes 1 instead.
+
+    Args:
+        scene: With training images.
+        periods: Those whose cameras and points count; None for all.
+    """
+    periods = range(scene.num_periods) if periods is None else periods
+    centres = _centres(_training_frames(scene, periods))
+    centre = centres.mean(axis=0)
+    radius = float(np.linalg.norm(centres - centre, axis=1).max())
+    if radius <= 1e-9 * max(1.0, float(np.abs(centre).max())):
+        points = scene.points.xyz
+        if len(periods) < scene.num_periods:
+            points = points[_seen(scene, periods).any(axis=1)]
+        distances = np.linalg.norm(points - centre, axis=1)
+        radius = float(np.median(distances)) if distances.size else 1.0
+    scale = 1.0 / radius if radius > 0 else 1.0
+    return Sim3(scale, np.eye(3), -scale * centre)
+
+
+def _training_frames(scene: Scene, periods: range) -> tuple[Frame, ...]:
+    """Training images of some periods."""
+    frames = tuple(f for f in scene.select(split="train") if f.period in periods)
+    if not frames:
+        raise SceneError(
+            f"{scene.root}: period {periods[-1]}",
+            expected="at least one training image",
+            found="none",
+            todo="move one from test to train, or use another strategy",
+        )
+    return frames
+
+
+def _seen(scene: Scene, periods: range) -> NDArray[np.bool_]:
+    """Return True where a training image of one of these periods sees the point. [P, T]"""
+    counts = [f.split == "train" and f.period in periods for f in scene.frames]
+    return scene.point_periods(np.array(counts))
+
+
+def _centres(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    return camera_centre(np.stack([f.cam_from_world for f in frames]))
+
+
+def _training_set(
+    scene: Scene,
+    store: ImageStore,
+    to_training: Sim3,
+    periods: range,
+    known: range,
+    *,
+    hide_period: bool,
+) -> TrainingSet:
+    """Training set of some periods, with the points of those that are known by then."""
+    frames, seen = _training_frames(scene, periods), _seen(scene, known)[:, : known.stop]
+    kept = seen.any(axis=1)
+    if not kept.any():
+        raise SceneError(
+            f"{scene.root}: period {known[-1]}" if len(known) == 1 else scene.root,
+            expected="sparse points that a training image sees",
+            found="none",
+            todo="triangulate points with COLMAP",
+        )
+    return TrainingSet(
+        views=tuple(_training_view(f, store, to_training, hide_period) for f in frames),
+        num_periods=1 if hide_period else known.stop,
+        points=to_training.apply(scene.points.xyz[kept]).astype(np.float32),
+        colors=scene.points.rgb[kept],
+        point_periods=np.ones((int(kept.sum()), 1), bool) if hide_period else seen[kept],
+        training_from_world=to_training,
+        camera_extent=_camera_extent(frames, to_training),
+        background=np.zeros(3, np.float32),
+        load_image=lambda i: store.load(frames[i]),
+        load_mask=lambda i: store.load_mask(frames[i]),
+        expect=lambda indices: store.expect([frames[i] for i in indices]),
+    )
+
+
+def _training_view(
+    frame: Frame, store: ImageStore, to_training: Sim3, hide_period: bool
+) -> TrainingView:
+    camera = store.camera(frame)
+    pose = to_training.apply_to_pose(frame.cam_from_world)
+    period = 0 if hide_period else frame.period
+    return TrainingView(camera.K, camera.width, camera.height, pose, frame.name, period)
+
+
+def _camera_extent(frames: Sequence[Frame], to_training: Sim3) -> float:
+    """1.1 times the largest distance of a camera from their mean; that of the scene for one camera.
+
+    An extent of zero would turn learning rates that are tied to it into zero.
+    """
+    centres = to_training.apply(_centres(frames))
+    radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    return EXTENT_MARGIN * (radius if radius > 1e-6 else 1.0)

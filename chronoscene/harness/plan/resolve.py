@@ -1,0 +1,139 @@
+"""A run with all that follows from its settings: made once when planned, once in its worker."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, replace
+from typing import Any
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.provenance import config_hash
+from chronoscene.harness.plan.job import Job
+from chronoscene.harness.plan.settings import SHARING, RunSettings
+from chronoscene.harness.plan.stop import StopRule
+from chronoscene.methods import MethodSpec, ProgramConfig, as_typed, build_config, load_spec
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedMethod:
+    """A method as all runs of a bench train it."""
+
+    reference: str
+    """Argument of `load_spec`."""
+    spec: MethodSpec
+    settings: RunSettings
+    """Their overrides are those of this method."""
+    config: Any
+    preset: dict[str, Any]
+    """Options of the preset that decide the result."""
+
+    def run(self, job: Job) -> ResolvedRun:
+        """Resolve a run of this method; its job gets its variant.
+
+        The variant lists the options that differ from the preset, and what else ends the run;
+        ``iterations=20+50`` is a training of 20 iterations that went on to 50.
+        """
+        config, settings = self.config, job.settings
+        if settings.iterations not in (None, config.iterations):
+            config = replace(config, iterations=settings.iterations)
+        options = deciding_options(config)
+        differ = {k: value for k, value in options.items() if value != self.preset[k]}
+        if job.continued_from:
+            lengths = [*job.continued_from, config.iterations]
+            differ["iterations"] = "+".join(map(str, lengths))
+        if settings.budget_seconds is not None:
+            if settings.iterations is not None:
+                differ["iterations"] = settings.iterations
+            differ["budget"] = f"{settings.budget_seconds:g}s"
+        if settings.separate_iterations != SHARING[0]:
+            differ["separate_iterations"] = settings.separate_iterations
+        variant = ",".join(f"{k}={as_typed(v)}" for k, v in differ.items())
+        return ResolvedRun.of(replace(job, variant=variant), self.spec, config)
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedRun:
+    """A job with its method, the configuration of it, and its end."""
+
+    job: Job
+    spec: MethodSpec
+    config: Any
+    """Frozen configuration of the method."""
+    stop: StopRule
+    """Number of iterations of the configuration, unless there is a time budget and no number."""
+    document: dict[str, Any]
+    """Everything that decides the result; written beside it as ``config.json``."""
+
+    @classmethod
+    def of(cls, job: Job, spec: MethodSpec, config: Any) -> ResolvedRun:
+        """Derive the end of the run and its document."""
+        settings = job.settings
+        stop = StopRule(int(config.iterations), settings.budget_seconds)
+        if settings.budget_seconds is not None and settings.iterations is None:
+            stop = StopRule(None, settings.budget_seconds)
+        decides = {
+            "method": job.method_name,
+            "preset": settings.preset,
+            "method_config": deciding_options(config),
+            "strategy": job.strategy,
+            "stop": dataclasses.asdict(stop),
+            "separate_iterations": settings.separate_iterations,
+            "max_width": settings.max_width,
+            **({"continued_from": job.continued_from} if job.continued_from else {}),
+        }
+        decides = json.loads(json.dumps(decides))
+        document = {
+            "config": decides,
+            "config_hash": config_hash(decides),
+            "scene": job.scene,
+            "scene_hash": job.scene_hash,
+            "seed": job.seed,
+            "device": settings.device,
+        }
+        return cls(job, spec, config, stop, document)
+
+    def stops(self, parts: int) -> tuple[StopRule, ...]:
+        """Return the end of the training of each model, or of each stage."""
+        each = self.job.settings.separate_iterations == "each"
+        return (self.stop,) * parts if each else self.stop.split(parts)
+
+
+def resolve_method(reference: str, spec: MethodSpec, settings: RunSettings) -> ResolvedMethod:
+    """Build the configuration of a method for all runs of a bench.
+
+    Raises:
+        ConfigError: If a preset, key or value does not exist.
+    """
+    settings = replace(settings, overrides=settings.overrides_of(spec.name))
+    preset = deciding_options(build_config(spec, preset=settings.preset))
+    return ResolvedMethod(reference, spec, settings, _config(spec, settings), preset)
+
+
+def resolve(job: Job) -> ResolvedRun:
+    """Resolve a planned job in the process that runs it."""
+    spec = load_spec(job.method)
+    return ResolvedRun.of(job, spec, _config(spec, job.settings))
+
+
+def _config(spec: MethodSpec, settings: RunSettings) -> Any:
+    overrides: dict[str, Any] = dict(settings.overrides)
+    if settings.iterations is not None:
+        overrides["iterations"] = settings.iterations
+    config = build_config(spec, preset=settings.preset, overrides=overrides)
+    iterations = getattr(config, "iterations", None)
+    if not isinstance(iterations, int) or iterations < 1:
+        raise ConfigError(
+            f"{spec.name}: iterations",
+            expected="a positive number",
+            found=repr(iterations),
+            todo="correct --iterations",
+        )
+    return config
+
+
+def deciding_options(config: Any) -> dict[str, Any]:
+    """Return the options of a method that its result depends on: all, but places of a program."""
+    options = dataclasses.asdict(config)
+    places = ("prefix", "source") if isinstance(config, ProgramConfig) else ()
+    return {name: value for name, value in options.items() if name not in places}

@@ -1,0 +1,319 @@
+"""Scores of a run, from its predictions and the frozen ground truth alone."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Set
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.errors import CheckpointError, ChronoSceneError, ShapeError
+from chronoscene.harness.files.ground_truth import ground_truth_folder
+from chronoscene.harness.files.predictions import ImageEntry, Manifest, load_image, read_manifest
+from chronoscene.harness.files.records import (
+    PREDICTIONS,
+    STAGES,
+    UNTRAINED,
+    RunRecord,
+    Values,
+    ViewScore,
+    read_rows,
+    read_run,
+    run_folders,
+    write_run,
+    write_summary,
+)
+from chronoscene.harness.files.strategies import period_part
+from chronoscene.harness.plan.job import Job
+from chronoscene.harness.score.forgetting import transfer
+from chronoscene.harness.score.regions import ALL, REGIONS, change_masks_hash, regions_of
+from chronoscene.io.wording import shown
+from chronoscene.metrics.registry import Scorers, all_metrics, make_scorers
+
+NO_TESTS = "trained on all photos: there are no test views"
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """All values of a run."""
+
+    rows: tuple[ViewScore, ...]
+    skipped: dict[str, str]
+    """Metric to the reason for its absence."""
+    unscored: tuple[str, ...] = ()
+    """Views without values, as their masks ignore every pixel."""
+    change_masks: str | None = None
+    """Fingerprint of the masks of the regions."""
+
+
+def score_folder(
+    predictions: Path, ground_truth: Path, scorers: Scorers, *, stage: bool = False
+) -> Scores:
+    """Score every predicted view that shows the period of its photo.
+
+    Args:
+        predictions: Predictions of a run, or of one of its stages.
+        ground_truth: The frozen photos.
+        scorers: The metrics.
+        stage: Accept missing views, and views that show the last known period.
+
+    Raises:
+        CheckpointError: If a manifest or an image is damaged, or the two do not belong together.
+    """
+    predicted, truth = read_manifest(predictions), read_manifest(ground_truth)
+    pairs = match_views(predictions, predicted, truth, stage=stage)
+    rows: list[ViewScore] = []
+    skipped, unscored = dict(scorers.skipped), []
+    for entry, target in pairs:
+        image, reference = load_image(predictions, entry), load_image(ground_truth, target)
+        periods = entry.camera_period, entry.rendered_period
+        for region, mask in regions_of(ground_truth, target):
+            if mask is not None and not mask.any():
+                if region == ALL:
+                    unscored.append(entry.view)
+                continue
+            values, refused = score_pair(image, reference, scorers, mask)
+            if region == ALL:
+                skipped |= {name: f"{entry.view}: {reason}" for name, reason in refused.items()}
+            rows += [ViewScore(entry.view, *periods, region, *value) for value in values.items()]
+    if not pairs:
+        skipped = dict.fromkeys([*scorers.functions, *scorers.skipped], NO_TESTS)
+    elif len(unscored) == len(pairs):
+        skipped |= dict.fromkeys(
+            scorers.functions, "the masks of all test views ignore every pixel"
+        )
+    # A metric that fails on one view has no mean over the test set.
+    kept = tuple(row for row in rows if row.metric not in skipped)
+    return Scores(kept, skipped, tuple(unscored), change_masks_hash(truth))
+
+
+def put_scores(record: RunRecord, scores: Scores) -> None:
+    """Put the means of scores into the record of their run."""
+    record.aggregates, record.periods = aggregate(scores.rows)
+    record.skipped, record.change_masks = scores.skipped, scores.change_masks
+    parts = {region: aggregate(scores.rows, region) for region in REGIONS if region != ALL}
+    record.regions = {
+        region: {"aggregates": aggregates, "periods": periods}
+        for region, (aggregates, periods) in parts.items()
+        if periods
+    }
+
+
+def score_run(staging: Path, record: RunRecord, truth: Path, scorers: Scorers) -> None:
+    """Score the predictions in the folder of a run, and write its record."""
+    scores = score_folder(staging / PREDICTIONS, truth, scorers)
+    put_scores(record, scores)
+    score_stages(staging, record, truth, scorers)
+    if scores.unscored:
+        views = shown(scores.unscored)
+        record.notices.append(
+            f"{record.label}: not scored, as their masks ignore every pixel: {views}"
+        )
+    write_run(staging, record, scores.rows)
+
+
+def score_stages(folder: Path, record: RunRecord, truth: Path, scorers: Scorers) -> None:
+    """Score the stages of a run, if it has any; earlier values of other metrics are kept.
+
+    The record has the scores of the last stage already.
+    """
+    stages: dict[str, dict[str, Values]] = {}
+    *names, last = UNTRAINED, *map(period_part, range(len(record.period_labels)))
+    for name in names if (folder / STAGES).is_dir() else ():
+        scores = score_folder(folder / STAGES / name, truth, scorers, stage=True)
+        _, stages[name] = aggregate(scores.rows)
+        for period, earlier in record.stages.get(name, {}).items():
+            stages[name][period] = earlier | stages[name].get(period, {})
+    if stages:
+        stages[last] = record.periods
+        record.stages, record.transfer = stages, transfer(stages)
+
+
+def score_job(job: Job, record: RunRecord) -> None:
+    """Score the run of a job with all metrics that are available."""
+    scorers = make_scorers(lpips_weights=job.settings.lpips_weights)
+    truth = ground_truth_folder(job.settings.runs, job.scene)
+    score_run(Path(job.staging), record, truth, scorers)
+
+
+def score_pair(
+    image: NDArray[np.uint8],
+    reference: NDArray[np.uint8],
+    scorers: Scorers,
+    mask: NDArray[np.bool_] | None = None,
+) -> tuple[Values, dict[str, str]]:
+    """Compute the values of one view, and reasons where its size or mask does not allow them.
+
+    Args:
+        image: The prediction. [H, W, 3]
+        reference: The photo. [H, W, 3]
+        scorers: The metrics.
+        mask: Pixels that count. The other pixels are taken from the photo, so that windows that
+            reach there see no difference. [H, W]
+    """
+    values, refused = {}, {}
+    if mask is not None:
+        image = np.where(mask[..., None], image, reference)
+    for name, function in scorers.functions.items():
+        try:
+            values[name] = function(image, reference, mask)
+        except ShapeError as error:
+            refused[name] = str(error)
+    return values, refused
+
+
+def match_views(
+    folder: Path, predicted: Manifest, truth: Manifest, *, stage: bool = False
+) -> list[tuple[ImageEntry, ImageEntry]]:
+    """Pair every test view, or those of a stage, with its prediction.
+
+    Raises:
+        CheckpointError: If the scene, a view or a size differs.
+    """
+    if predicted.scene_hash != truth.scene_hash:
+        raise _mismatch(folder, f"scene {truth.scene_hash[:12]}", predicted.scene_hash[:12])
+    by_view = {e.view: e for e in predicted.images if stage or e.rendered_period == e.camera_period}
+    targets = {e.view: e for e in truth.images if not stage or e.view in by_view}
+    if missing := sorted(targets.keys() ^ by_view.keys()):
+        raise _mismatch(folder, "one prediction per test view", f"a difference at {missing[0]!r}")
+    for view, target in targets.items():
+        mine = by_view[view]
+        if (mine.width, mine.height) != (target.width, target.height):
+            size = f"{target.width} x {target.height} pixels for {view!r}"
+            raise _mismatch(folder, size, f"{mine.width} x {mine.height}")
+    return [(by_view[view], target) for view, target in targets.items()]
+
+
+def _mismatch(folder: Path, expected: str, found: str) -> CheckpointError:
+    return CheckpointError(
+        folder, expected=expected, found=found, todo="delete the run and run bench again"
+    )
+
+
+def aggregate(
+    rows: Iterable[ViewScore], region: str = ALL
+) -> tuple[dict[str, Values], dict[str, Values]]:
+    """Compute the means of the rows of a region.
+
+    Returns:
+        aggregates: ``macro`` (mean over periods of their means), ``micro`` (mean over views) and
+            ``worst`` (mean of the worst period), each metric to value.
+        periods: Period id as text to metric to mean over its views.
+    """
+    groups: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        if row.region == region:
+            groups[row.metric][row.camera_period].append(row.value)
+    aggregates: dict[str, Values] = {"macro": {}, "micro": {}, "worst": {}}
+    periods: dict[str, Values] = {}
+    for metric, by_period in groups.items():
+        means = {period: float(np.mean(by_period[period])) for period in sorted(by_period)}
+        worst = min if all_metrics()[metric].higher_is_better else max
+        aggregates["macro"][metric] = float(np.mean(list(means.values())))
+        aggregates["micro"][metric] = float(np.mean([v for p in by_period.values() for v in p]))
+        aggregates["worst"][metric] = worst(means.values())
+        for period, mean in means.items():
+            periods.setdefault(str(period), {})[metric] = mean
+    return aggregates, dict(sorted(periods.items(), key=lambda item: int(item[0])))
+
+
+def changes(before: Mapping[str, Values], after: Mapping[str, Values]) -> list[str]:
+    """Describe differences between two sets of aggregates, one line per metric."""
+    old, new = before.get("macro", {}), after.get("macro", {})
+    lines = []
+    for name in dict.fromkeys([*old, *new]):
+        if name not in old:
+            lines.append(f"{name} new: {new[name]:.6g}")
+        elif name not in new:
+            lines.append(f"{name} dropped, was {old[name]:.6g}")
+        elif any(before[kind][name] != after[kind][name] for kind in after):
+            lines.append(f"{name} {old[name]:.6g} -> {new[name]:.6g} (macro)")
+    return lines
+
+
+@dataclass(frozen=True, slots=True)
+class Rescored:
+    """Result of scoring a run again."""
+
+    folder: Path
+    changes: list[str]
+    """Empty if every aggregate is what it was."""
+    kept: list[str]
+    """Metrics that could not be computed now and keep their earlier values."""
+    error: str | None = None
+    """Reason why the run could not be scored; it is left as it was."""
+
+
+def rescore(
+    runs: Path, scorers: Scorers, *, progress: Callable[[int, int], None] | None = None
+) -> list[Rescored]:
+    """Score every finished run below a folder again.
+
+    Args:
+        runs: Folder that bench wrote.
+        scorers: The metrics.
+        progress: Called with the runs done and their total, before each run.
+
+    Raises:
+        CheckpointError: If there is no finished run.
+    """
+    folders = run_folders(runs)
+    if not folders:
+        raise CheckpointError(
+            runs, expected="a folder of runs", found="no finished run in it", todo="run bench first"
+        )
+    outcomes: list[Rescored] = []
+    for folder in folders:
+        if progress is not None:
+            progress(len(outcomes), len(folders))
+        outcomes.append(_rescore_one(runs, folder, scorers))
+    write_summary(runs)
+    return outcomes
+
+
+def _rescore_one(runs: Path, folder: Path, scorers: Scorers) -> Rescored:
+    try:
+        record = read_run(folder)
+        before, parts = record.aggregates, record.regions
+        truth = ground_truth_folder(runs, record.scene)
+        scores = score_folder(folder / PREDICTIONS, truth, scorers)
+        kept, scores = keep_earlier(folder, record, scores, scorers.unasked)
+        put_scores(record, scores)
+        score_stages(folder, record, truth, scorers)
+    except ChronoSceneError as error:
+        return Rescored(folder, [], [], str(error))
+    write_run(folder, record, scores.rows)
+    lines = changes(before, record.aggregates)
+    for region, part in record.regions.items():
+        old = parts.get(region, {}).get("aggregates", {})
+        lines += [f"{region}: {line}" for line in changes(old, part["aggregates"])]
+    return Rescored(folder, lines, kept)
+
+
+def keep_earlier(
+    folder: Path, record: RunRecord, scores: Scores, unasked: Set[str]
+) -> tuple[list[str], Scores]:
+    """Keep earlier values of metrics that are not available here, or were not asked for.
+
+    They hold, as hashes prove that the images are the same; values of regions hold if the change
+    masks are the same.
+
+    Returns:
+        Names of the kept metrics that cannot be computed, and all scores.
+    """
+    there = record.aggregates.get("macro", {})
+    kept = [name for name in scores.skipped if name in there]
+    if not kept and unasked.isdisjoint(there):
+        return [], scores
+    holds = record.change_masks == scores.change_masks
+    earlier = tuple(
+        row
+        for row in read_rows(folder)
+        if (row.metric in kept or row.metric in unasked) and (holds or row.region == ALL)
+    )
+    skipped = {name: reason for name, reason in scores.skipped.items() if name not in kept}
+    rows = sorted(scores.rows + earlier, key=lambda row: row.view)
+    return kept, replace(scores, rows=tuple(rows), skipped=skipped)

@@ -1,0 +1,92 @@
+"""Run records survive JSON, also with infinite values; damaged ones are named."""
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from chronoscene.errors import CheckpointError
+from chronoscene.harness.files.records import (
+    ViewScore,
+    read_rows,
+    read_run,
+    run_folders,
+    write_run,
+    write_summary,
+)
+
+JOINT = "ring/mean-joint-balanced/seed0"
+
+
+def refuse(constant):
+    raise AssertionError(f"{constant} is not JSON")
+
+
+def test_infinite_psnr_is_plain_json(runs):
+    record = read_run(runs / JOINT)
+    record.aggregates["macro"]["psnr"] = math.inf
+    rows = [ViewScore("a/2.png", 0, 0, "all", "psnr", math.inf)]
+    write_run(runs / JOINT, record, rows)
+    document = json.loads((runs / JOINT / "run.json").read_text(), parse_constant=refuse)
+    assert document["aggregates"]["macro"]["psnr"] == "Infinity"
+    assert read_run(runs / JOINT) == record
+    assert read_rows(runs / JOINT) == rows
+    write_summary(runs)
+    json.loads((runs / "results.json").read_text(), parse_constant=refuse)
+
+
+def test_the_summary_is_made_from_the_runs_alone(runs):
+    before = (runs / "results.json").read_text(), (runs / "rows.csv").read_text()
+    (runs / "results.json").unlink()
+    (runs / "rows.csv").unlink()
+    assert [r.strategy for r in write_summary(runs)] == ["pooled", "joint", "pooled", "separate"]
+    assert ((runs / "results.json").read_text(), (runs / "rows.csv").read_text()) == before
+
+
+def test_half_written_runs_are_not_runs(runs):
+    (runs / JOINT).rename((runs / JOINT).with_name(".seed0.77.partial"))
+    assert len(run_folders(runs)) == 3
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda d: d.pop("seconds"), "Field required .seconds"),
+        (lambda d: d.update(seed="first"), "seed"),
+        (lambda d: d.update(surprise=1), "surprise"),
+    ],
+)
+def test_damaged_records_are_named(runs, edit, message):
+    path = runs / JOINT / "run.json"
+    document = json.loads(path.read_text())
+    edit(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(CheckpointError, match=message):
+        read_run(runs / JOINT)
+
+
+def test_damaged_rows_are_named(runs):
+    path = runs / JOINT / "rows.csv"
+    path.write_text(path.read_text().replace(",all,psnr,", ",all,psnr,many"))
+    with pytest.raises(CheckpointError, match=r"rows\.csv: expected the rows of a run"):
+        read_rows(runs / JOINT)
+
+
+def test_missing_runs_are_named(tmp_path):
+    with pytest.raises(CheckpointError, match="no such file; run bench first"):
+        read_run(tmp_path)
+
+
+def test_all_keys_and_columns_are_in_the_documentation(finished_bench):
+    runs = finished_bench[0]
+    text = (Path(__file__).parents[3] / "docs/reference/results.md").read_text(encoding="utf-8")
+    documents = json.loads((runs / "results.json").read_text())
+    keys = {key for document in documents for key in (*document, *document["aggregates"])}
+    with (runs / "rows.csv").open(newline="") as file:
+        keys |= {*next(csv.reader(file))}
+    for path in runs.glob("*/*/seed0/curve.csv"):
+        keys |= {*path.read_text().splitlines()[0].split(",")}
+    missing = {key for key in keys if f"`{key}`" not in text}
+    assert not missing

@@ -1,0 +1,157 @@
+"""Budgets are parsed, progress never leaves 0..1, shares add up."""
+
+import json
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.command_line import command_line
+from chronoscene.harness.plan.job import Job
+from chronoscene.harness.plan.resolve import resolve, resolve_method
+from chronoscene.harness.plan.settings import RunSettings
+from chronoscene.harness.plan.stop import StopRule, parse_duration
+from chronoscene.methods import load_spec
+
+JOB = Job(
+    scene_root="/scene", scene_format="chronoscene", scene="scene", scene_hash="1", split_hash="2",
+    method="toy_methods:MEAN", method_name="mean", strategy="separate", seed=0, commit="3",
+    settings=RunSettings(Path("/runs"), iterations=9, device="cpu"),
+)  # fmt: skip
+
+
+def changed(change: dict[str, Any]) -> Job:
+    """The job with other values of its own or of its settings."""
+    own = {name: value for name, value in change.items() if name in Job.__slots__}
+    others = {name: value for name, value in change.items() if name not in own}
+    return replace(JOB, **own).with_settings(**others)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("90s", 90), ("5m", 300), ("1.5h", 5400), ("1h30m", 5400), ("2m3.5s", 123.5)],
+)
+def test_durations(text, seconds):
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "5", "m", "0s", "-5m", "5 m", "5min", "1e3s", "5m!"])
+def test_other_texts_are_refused(text):
+    with pytest.raises(ConfigError, match="--budget: expected a positive time such as 90s"):
+        parse_duration(text)
+
+
+@given(
+    st.one_of(st.none(), st.integers(1, 10**6)),
+    st.one_of(st.none(), st.floats(0.01, 1e5)),
+    st.integers(0, 10**7),
+    st.floats(0, 1e6),
+)
+def test_progress_is_a_share(iterations, budget, done, seconds):
+    rule = StopRule(iterations, budget)
+    progress = rule.progress(done, seconds)
+    assert 0 <= progress <= 1
+    assert rule.progress(done + 1, seconds + 1) >= progress
+
+
+def test_progress_by_hand():
+    assert StopRule(200, None).progress(50, 1e9) == 0.25
+    assert StopRule(None, 10.0).progress(10**9, 2.5) == 0.25
+    assert StopRule(200, 10.0).progress(50, 9.0) == 0.9
+    assert StopRule(200, 10.0).progress(190, 1.0) == 0.95
+    assert StopRule(200, None).progress(200, 0.0) == 1.0
+
+
+@given(st.integers(1, 10**5), st.integers(1, 60))
+def test_shares_add_up(iterations, parts):
+    shares = [rule.iterations for rule in StopRule(iterations, None).split(parts)]
+    assert sum(shares) == iterations
+    assert max(shares) - min(shares) <= 1
+
+
+def test_budgets_are_shared():
+    assert StopRule(None, 9.0).split(3) == (StopRule(None, 3.0),) * 3
+    assert StopRule(7, 9.0).split(3) == (StopRule(3, 3.0), StopRule(2, 3.0), StopRule(2, 3.0))
+
+
+def test_time_left_follows_the_pace():
+    assert StopRule(100, None).seconds_left(25, 5.0) == pytest.approx(15.0)
+    assert StopRule(None, 60.0).seconds_left(3, 20.0) == pytest.approx(40.0)
+    assert StopRule(100, None).seconds_left(0, 0.0) is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"scene_hash": "4"}, {"strategy": "joint"}, {"overrides": {"rate": "0.25"}}, {"seed": 1},
+        {"iterations": 10}, {"budget_seconds": 60.0}, {"separate_iterations": "each"},
+        {"max_width": 800}, {"device": "auto"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_decides_the_result_is_compared(change):
+    assert resolve(changed(change)).document != resolve(JOB).document
+
+
+def test_where_and_how_fast_it_runs_is_not_compared():
+    other = changed({"runs": Path("/other"), "threads": 3, "commit": "5", "scene_root": "/copy"})
+    assert resolve(other).document == resolve(JOB).document
+
+
+def test_a_job_goes_through_json_unchanged():
+    job = changed({"lpips_weights": Path("/weights"), "overrides": {"rate": "1"}, "memory": 7})
+    assert Job.from_document(json.loads(json.dumps(job.document()))) == job
+
+
+def test_folders_have_names_that_file_systems_take():
+    one, other = (replace(JOB, variant=f"a={'9' * 300}{i}").folder.parent.name for i in (1, 2))
+    assert len(one) < 200 and one[:180] == other[:180] and one != other
+    assert replace(JOB, variant="path=/a").folder.parent.name.endswith("-path=%2Fa")
+
+
+@pytest.mark.parametrize(
+    ("changes", "variant"),
+    [
+        ({"iterations": 20}, ""),
+        ({"iterations": 9, "overrides": {"rate": "0.25", "sleep": "0"}}, "iterations=9,rate=0.25"),
+        ({"iterations": None, "budget_seconds": 90.0}, "budget=90s"),
+        ({"iterations": 20, "budget_seconds": 1.5}, "iterations=20,budget=1.5s"),
+        ({"iterations": 9, "continued_from": [3, 5]}, "iterations=3+5+9"),
+        ({"iterations": 20, "separate_iterations": "each"}, "separate_iterations=each"),
+    ],
+    ids=str,
+)
+def test_variants_are_named_by_what_differs_from_the_preset(changes, variant):
+    job = changed(changes)
+    method = resolve_method(job.method, load_spec(job.method), job.settings)
+    assert method.run(job).job.variant == variant
+
+
+def test_the_command_names_what_differs_from_the_preset():
+    variant = 'iterations=50,heads=["a", "b"],budget=90s,separate_iterations=each,max_width=800'
+    config = {"method": "m", "strategy": "joint", "preset": "fast", "variant": variant}
+    assert shlex.split(command_line("DIR", config))[9:] == [
+        *("--iterations", "50", "--set", 'heads=["a", "b"]', "--budget", "90s"),
+        *("--separate-iterations", "each", "--max-width", "800"),
+    ]
+    config["variant"] = "iterations=20+50"
+    assert command_line("DIR", config).endswith(" --continue-to 50")
+    config["variant"] = "sh_degree=2,budget=90s"
+    assert command_line("DIR", config, 0).endswith("--seed 0 --set sh_degree=2 --budget 90s")
+
+
+@pytest.mark.parametrize(
+    ("label", "option"),
+    [("0.1dB", "--max-loss 0.1"), ("1e-05dB", "--max-loss 1e-05"), ("plain", "--plain")],
+)
+def test_two_commands_make_a_compressed_run(label, option):
+    variant = f"sh_degree=2,compressed={label},max_width=800"
+    config = {"method": "m", "strategy": "joint", "preset": "fast", "variant": variant}
+    train, compress = command_line("DIR", config).split(" && ")
+    assert train.endswith("--preset fast --set sh_degree=2 --max-width 800")
+    assert compress == f"chronoscene compress RUN {option}"

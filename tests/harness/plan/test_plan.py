@@ -1,0 +1,53 @@
+"""Plans: whose overrides they are, and what a run differs in."""
+
+import shutil
+
+from chronoscene import methods
+from chronoscene.harness.plan import resolve
+from chronoscene.harness.plan.finished import first_difference
+from chronoscene.harness.plan.plan import plan_runs
+from chronoscene.harness.plan.settings import RunSettings, bench_settings
+from chronoscene.harness.use.trained_run import open_run
+
+
+def test_differences_are_named():
+    old = {"config": {"a": 1, "b": {"c": 2}}, "seed": 0}
+    new = {"config": {"a": 1, "b": {"c": 3}}, "seed": 0}
+    assert first_difference(old, new) == ("c 2", "c 3")
+
+
+def test_overrides_with_a_prefix_are_for_one_method(tmp_path):
+    settings = RunSettings(tmp_path, overrides={"blind.rate": "1", "rate": "2"})
+    assert settings.overrides_of("mean") == {"rate": "2"}
+    assert settings.overrides_of("blind") == {"rate": "1"}
+
+
+def test_planning_builds_each_configuration_once(scene_folder, tmp_path, monkeypatch):
+    """That of the preset and that with overrides of each method, whatever the number of runs."""
+    built = []
+
+    def build_config(spec, **options):
+        built.append(spec.name)
+        return methods.build_config(spec, **options)
+
+    monkeypatch.setattr(resolve, "build_config", build_config)
+    names = ("toy_methods:MEAN", "toy_methods:BLIND")
+    settings = bench_settings((scene_folder,), names, tmp_path / "runs", seeds=(0, 1))
+    assert len(plan_runs(settings, lambda line: None).runs) == 4
+    assert sorted(built) == ["blind", "blind", "mean", "mean"]
+
+
+def test_periods_that_the_user_names_hold_for_the_whole_run(
+    bench_here, scene_folder, tmp_path, monkeypatch
+):
+    """For the planning, the training, and whoever opens the run from another folder."""
+    folder = tmp_path / "project"
+    shutil.copytree(scene_folder, folder)
+    (folder / "sparse/split.txt").unlink()
+    rows = [f"{name}/{i}.png,{i // 2}" for name in "ab" for i in range(4)]
+    (tmp_path / "periods.csv").write_text("\n".join(["file,period", *rows]))
+    monkeypatch.chdir(tmp_path)
+    outcome, _ = bench_here("toy_methods:MEAN", scenes=(folder,), period_by="table:periods.csv")
+    monkeypatch.chdir("/")
+    (run,) = map(open_run, outcome.finished)
+    assert [frame.period for frame in run.scene().frames] == [0, 0, 1, 1] * 2

@@ -1,0 +1,18 @@
+"""The heat map of runs in stages."""
+
+import numpy as np
+from PIL import Image
+
+from chronoscene.harness.report.stage_figure import draw_stages
+from chronoscene.harness.report.summary import read_runs
+
+
+def test_runs_in_stages_are_drawn_and_no_others(bench_here, tmp_path):
+    runs = tmp_path / "runs"
+    bench_here("toy_methods:MEAN")
+    assert draw_stages(runs, read_runs([runs])[0]) == []
+    bench_here("toy_methods:MEAN", "toy_methods:BLIND", strategies=("sequential",), seeds=(0, 1))
+    assert draw_stages(runs, read_runs([runs])[0]) == [runs / "figures/ring_stages.png"]
+    pixels = np.array(Image.open(runs / "figures/ring_stages.png").convert("RGB")).reshape(-1, 3)
+    assert len(pixels) > 10_000
+    assert (pixels == [255, 0, 0]).all(axis=1).any(), "the line around what was seen"

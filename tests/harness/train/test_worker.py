@@ -1,0 +1,125 @@
+"""Runs of real methods through the harness, in this process."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from chronoscene.formats import chronoscene as scene_format
+from chronoscene.harness.files.records import read_run
+from chronoscene.harness.report.summary import read_runs
+from chronoscene.harness.report.tables import format_runs
+from chronoscene.methods import load_spec, method_names
+from chronoscene.training import photometric
+from chronoscene.training.checkpoint import load_tensors
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_a_photo_that_shows_nothing_is_an_empty_step(make_scene, tmp_path, bench_here, method):
+    scene = make_scene()
+    blind = next(frame for frame in scene.frames if frame.split == "train")
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ blind.cam_from_world
+    frames = tuple(replace(f, cam_from_world=turned) if f is blind else f for f in scene.frames)
+    folder = scene_format.write(replace(scene, frames=frames), tmp_path / "ring")
+    outcome, _ = bench_here(method, scenes=(folder,), preset="fast", iterations=15)
+    assert outcome.failures == ()
+    record = read_run(outcome.finished[0])
+    assert (record.iterations, record.empty_steps, record.skipped_steps) == (15, 3, 0)
+    assert np.isfinite(record.aggregates["macro"]["psnr"])
+    tables = format_runs(*read_runs([tmp_path / "runs"]), "table")
+    assert "3 of 15 steps empty: their photos show nothing of the model" in tables
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_every_method_learns_one_period_after_the_other(bench_here, method):
+    options = {"strategies": ("sequential",), "preset": "fast", "iterations": 16}
+    outcome, said = bench_here(method, **options)
+    assert outcome.failures == ()
+    assert "note: sequential: the stages of a run share the iterations and time" in said
+    folder, record = outcome.finished[0], read_run(outcome.finished[0])
+    assert (record.strategy, record.iterations) == ("sequential", 16)
+    assert {stage: set(periods) for stage, periods in record.stages.items()} == {
+        "untrained": {"1"}, "period-0": {"0", "1"}, "period-1": {"0", "1"}
+    }  # fmt: skip
+    assert record.stages["period-1"] == record.periods
+    assert set(record.transfer) == {"forgetting", "backward_transfer", "forward_transfer"}
+    assert set(record.transfer["forgetting"]) == set(record.aggregates["macro"])
+    models = [folder / "checkpoint" / name for name in ("period-0", "period-1")]
+    sizes = [sum(path.stat().st_size for path in model.iterdir()) for model in models]
+    assert record.checkpoint_bytes == sizes[1]
+    periods = [load_tensors(model)[1]["num_periods"] for model in models]
+    assert periods == ([1, 1] if load_spec(method).period_input == "none" else [1, 2])
+
+
+def test_no_stage_looks_at_later_photos(scene_folder, tmp_path, bench_here):
+    models = []
+    for k in range(2):
+        folder = shutil.copytree(scene_folder, tmp_path / f"{k}/ring")
+        for path in (folder / "images/b").glob("*.png") if k else ():
+            Image.effect_noise((24, 16), 90).convert("RGB").save(path)
+        options = {"preset": "fast", "iterations": 16, "runs": tmp_path / f"runs{k}"}
+        outcome, _ = bench_here("3dgs", scenes=(folder,), strategies=("sequential",), **options)
+        saved = outcome.finished[0] / "checkpoint"
+        files = sorted(saved.glob("*/model.safetensors"))
+        models.append([path.read_bytes() for path in files])
+    assert models[0][0] == models[1][0] and models[0][1] != models[1][1]
+
+
+def test_a_scene_with_masks_is_trained_and_scored_by_what_counts(
+    scene_folder, tmp_path, bench_here
+):
+    """The runs of two scenes that differ only where masks ignore them are the same."""
+    mask = np.full((16, 24), 255, np.uint8)
+    mask[4:9, 3:20] = 0
+    results = []
+    for k in range(2):
+        folder = shutil.copytree(scene_folder, tmp_path / f"{k}/ring")
+        for path in sorted((folder / "images").rglob("*.png")):
+            pixels = np.array(Image.open(path))
+            pixels[mask == 0] = 200 * k
+            Image.fromarray(pixels).save(path)
+            target = folder / "masks" / path.relative_to(folder / "images").with_suffix(".png.png")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            values = np.zeros_like(mask) if path.name == "1.png" else mask
+            Image.fromarray(values).save(target)
+        options = {"preset": "fast", "iterations": 15, "runs": tmp_path / f"runs{k}"}
+        outcome, _ = bench_here("3dgs", scenes=(folder,), **options)
+        record = read_run(outcome.finished[0])
+        assert record.empty_steps > 0  # a/1 is a training image
+        assert any("not scored" in n and "'b/1.png'" in n for n in record.notices)
+        model = (outcome.finished[0] / "checkpoint/model.safetensors").read_bytes()
+        results.append((model, record.aggregates["micro"]["psnr"], record.scene_hash))
+        assert len(list((tmp_path / f"runs{k}/ground_truth").rglob("*.mask.png"))) == 3
+    assert results[0][0] == results[1][0]
+    assert results[0][1] == results[1][1] and results[0][2] != results[1][2]
+
+
+def poison(monkeypatch, numbers):
+    """The gradients of the loss are not finite in these calls."""
+    backward, calls = photometric._PhotometricLoss.backward, []
+
+    def poisoned(ctx, *grads):
+        gradient, *others = backward(ctx, *grads)
+        calls.append(1)
+        return (gradient * np.nan if len(calls) in numbers else gradient, *others)
+
+    monkeypatch.setattr(photometric._PhotometricLoss, "backward", staticmethod(poisoned))
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_gradients_that_are_not_finite_cost_their_step_alone(bench_here, monkeypatch, method):
+    poison(monkeypatch, (4, 5, 9))
+    outcome, _ = bench_here(method, preset="fast", iterations=15)
+    record = read_run(outcome.finished[0])
+    assert (record.iterations, record.empty_steps, record.skipped_steps) == (15, 0, 3)
+    assert "3 of 15 steps skipped: their loss or gradients" in " ".join(record.notices)
+
+
+def test_a_training_that_diverges_keeps_its_last_good_model(tmp_path, bench_here, monkeypatch):
+    poison(monkeypatch, range(8, 100))
+    outcome, _ = bench_here("3dgs", preset="fast", iterations=100)
+    assert "the model of iteration 7 is kept in checkpoint" in outcome.failures[0].reason
+    (kept,) = (tmp_path / "runs").rglob("checkpoint")
+    assert all(tensor.isfinite().all() for tensor in load_tensors(kept)[0].values())

@@ -1,0 +1,114 @@
+"""``chronoscene compress``: runs whose models take few bytes, beside those that they come from."""
+
+import shutil
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli
+from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.harness.files.predictions import load_image, read_manifest, to_bytes
+from chronoscene.harness.files.records import read_run, run_folders
+from chronoscene.harness.use.compression import compress_run, spread
+from chronoscene.harness.use.trained_run import open_run
+from chronoscene.images.store import ImageStore
+from chronoscene.metrics.psnr_ssim import psnr
+
+
+def compress(folder, *options):
+    """Compress a run; returns the folder of the new one, and what is printed."""
+    arguments = ["compress", str(folder), *options]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    (out,) = {*run_folders(folder.parents[2])} - {folder}
+    return out, result.stdout
+
+
+@pytest.fixture
+def copied(trained, tmp_path):
+    """A function that copies a trained run into runs of its own, with the ground truth."""
+
+    def copy(method):
+        folder = trained[method]
+        runs = tmp_path / "runs"
+        shutil.copytree(folder.parents[2] / "ground_truth", runs / "ground_truth")
+        shutil.copytree(folder, runs.joinpath(*folder.parts[-3:]))
+        return runs.joinpath(*folder.parts[-3:])
+
+    return copy
+
+
+@pytest.mark.parametrize("method", ["chronogs", "3dgs-period", "4dgs"])
+def test_the_plain_form_is_a_run_that_renders_and_scores_as_before(copied, method):
+    folder = copied(method)
+    out, printed = compress(folder, "--plain")
+    before, after = read_run(folder), read_run(out)
+    files = [file for file in (out / "checkpoint").rglob("*") if file.is_file()]
+    assert {file.name for file in files} == {"model.json", "model.compressed"}
+    assert after.checkpoint_bytes == sum(file.stat().st_size for file in files)
+    assert f"{before.checkpoint_bytes:,} bytes -> {after.checkpoint_bytes:,} bytes" in printed
+    assert after.checkpoint_bytes < 0.7 * before.checkpoint_bytes
+    assert after.variant.endswith("compressed=plain") and after.config_hash != before.config_hash
+    macro = before.aggregates["macro"]["psnr"]
+    assert after.aggregates["macro"]["psnr"] == pytest.approx(macro, abs=0.02)
+    run = open_run(out)
+    for frame in run.scene().select(split="test"):
+        entry = next(e for e in read_manifest(out / "predictions").images if e.view == frame.name)
+        image = run.render(frame.camera, frame.cam_from_world, frame.period).rgb
+        written = load_image(out / "predictions", entry)
+        np.testing.assert_allclose(255 * image.clip(0, 1), written, atol=0.51)
+
+
+def training_psnr(folder):
+    """Mean over the training views."""
+    run = open_run(folder)
+    scene, values = run.scene(), []
+    for frame in scene.select(split="train"):
+        image = to_bytes(run.render(frame.camera, frame.cam_from_world, frame.period).rgb)
+        values.append(psnr(image, ImageStore(scene).load(frame)))
+    return np.mean(values)
+
+
+def test_training_views_lose_what_is_allowed_and_hardly_less(copied, monkeypatch):
+    pytest.importorskip("constriction", reason="coded models need constriction")
+    monkeypatch.setattr("chronoscene.harness.use.compression.MIN_ROWS", 4)
+    folder = copied("chronogs")
+    out, _ = compress(folder, "--max-loss", "0.5")
+    assert read_run(out).variant.endswith("compressed=0.5dB")
+    assert 0.3 < training_psnr(folder) - training_psnr(out) <= 0.5 + 1e-6
+
+
+def test_a_damaged_model_is_refused(copied):
+    out, _ = compress(copied("chronogs"), "--plain")
+    file = out / "checkpoint/model.compressed"
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match=r"model\.compressed: .*digest"):
+        open_run(out).model(0)
+
+
+def test_every_period_has_a_view_however_many_there_are(copied):
+    frames = open_run(copied("chronogs")).scene().frames
+    many = [replace(frames[0], period=i % 40, image_id=i) for i in range(100)]
+    assert [f.period for f in spread(many, 9)] == list(range(40))
+    assert [f.image_id for f in spread(many[:1] * 7, 3)] == [0] * 3
+    assert spread(many[::40], 99) == tuple(many[::40])
+
+
+def test_a_run_in_stages_is_refused(copied):
+    run = open_run(copied("chronogs"))
+    staged = replace(run, record=run.record.model_copy(update={"strategy": "sequential"}))
+    with pytest.raises(ConfigError, match=r"one model, or one per period.*sequential"):
+        compress_run(staged, run.scene(), max_loss=None, log=print)
+
+
+def test_a_loss_that_half_floats_exceed_is_refused(copied, monkeypatch):
+    monkeypatch.setattr("chronoscene.harness.use.compression.MIN_ROWS", 4)
+    falling = count(30, -1)
+    part = "chronoscene.harness.use.compression._SortedModel.psnr"
+    monkeypatch.setattr(part, lambda self, tensors: next(falling))
+    run = open_run(copied("chronogs"))
+    with pytest.raises(ConfigError, match=r"--max-loss 0.5: .*allow more"):
+        compress_run(run, run.scene(), max_loss=0.5, log=print)

@@ -1,0 +1,176 @@
+"""An opened run renders what the run rendered, and refuses what its models do not claim."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chronoscene.errors import CheckpointError, ConfigError, SceneError
+from chronoscene.harness.files.predictions import load_image, read_manifest, to_bytes
+from chronoscene.harness.files.records import CONFIG_FILE, PREDICTIONS, SOURCE_FILE
+from chronoscene.harness.plan.settings import bench_settings
+from chronoscene.harness.run.runner import run_bench
+from chronoscene.harness.use.trained_run import TrainedRun, open_run
+
+STRATEGIES = ("joint", "pooled", "separate")
+
+
+def folder_of(runs: Path, strategy: str = "joint") -> Path:
+    return runs / "ring" / f"mean-{strategy}-balanced" / "seed0"
+
+
+def assert_renders_its_predictions(run: TrainedRun) -> None:
+    frames = {frame.name: frame for frame in run.scene().frames}
+    entries = read_manifest(run.folder / PREDICTIONS).images
+    assert len(entries) == 3
+    for entry in entries:
+        frame = frames[entry.view]
+        image = run.render(frame.camera, frame.cam_from_world, frame.period).rgb
+        stored = load_image(run.folder / PREDICTIONS, entry)
+        np.testing.assert_array_equal(to_bytes(image), stored)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_an_opened_run_renders_its_predictions(runs, strategy):
+    assert_renders_its_predictions(open_run(folder_of(runs, strategy)))
+
+
+def test_a_run_of_gaussians_renders_its_predictions_with_depth_in_world_units(
+    scene_folder, tmp_path
+):
+    """The camera, pose and training frame matter here, unlike to a method of one colour."""
+    settings = bench_settings(
+        scenes=(scene_folder,), methods=("3dgs",), runs=tmp_path, threads=1, iterations=5
+    )
+    run_bench(settings, lambda line: None)
+    run = open_run(tmp_path / "ring" / "3dgs-pooled-balanced-iterations=5" / "seed0")
+    assert_renders_its_predictions(run)
+    scene = run.scene()
+    frame = scene.frames[0]
+    depth = run.render(frame.camera, frame.cam_from_world, 0).depth
+    local = scene.points.xyz @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
+    nearest, farthest = np.quantile(local[:, 2], [0.0, 1.0])
+    assert nearest - 1 < np.median(depth[depth > 0]) < farthest + 1
+
+
+def test_the_scene_may_have_moved(runs, scene_folder, tmp_path):
+    run = open_run(folder_of(runs))
+    run = replace(run, source=run.source.model_copy(update={"scene_root": str(tmp_path / "old")}))
+    with pytest.raises(SceneError, match=r"old: expected the scene .* found nothing; .* --scene"):
+        run.scene()
+    moved = shutil.copytree(scene_folder, tmp_path / "moved")
+    assert run.scene(moved).name == "moved"
+    (moved / "images/a/0.png").write_bytes((moved / "images/a/1.png").read_bytes())
+    with pytest.raises(SceneError, match=r"found another scene, or a changed one; .* --scene"):
+        run.scene(moved)
+
+
+def test_the_method_may_be_gone(runs):
+    file = folder_of(runs) / SOURCE_FILE
+    source = json.loads(file.read_text())
+    file.write_text(json.dumps(source | {"method": "moved:SPEC", "plugin_path": "/old/place"}))
+    with pytest.raises(ConfigError, match=r"moved:SPEC: expected .* from /old/place, .*PYTHONPATH"):
+        open_run(folder_of(runs))
+    file.write_text(json.dumps(source | {"method": "gone", "plugin_path": None}))
+    with pytest.raises(ConfigError, match="gone: expected the method of the run, from unpackaged"):
+        open_run(folder_of(runs))
+
+
+@pytest.mark.parametrize(
+    ("text", "periods"), [("autumn", (1,)), ("1", (1,)), ("spring:1", (0, 1)), ("1:0", (1, 0))]
+)
+def test_periods_have_numbers_and_labels(runs, text, periods):
+    assert open_run(folder_of(runs)).parse_periods(text) == periods
+
+
+def test_a_label_is_a_label_whatever_it_looks_like(runs):
+    run = open_run(folder_of(runs))
+    run.record.period_labels = {"0": "1", "1": "12:30"}
+    assert (run.parse_periods("1"), run.parse_periods("12:30")) == ((0,), (1,))
+
+
+@pytest.mark.parametrize(
+    ("strategy", "period", "message"),
+    [
+        ("joint", 2, "period 2: expected one from 0 to 1.*0 .spring., 1 .autumn."),
+        ("joint", -1, "period -1: expected one from 0 to 1"),
+        ("joint", float("nan"), "period nan: expected one from 0 to 1"),
+        ("joint", 0.5, "a whole number: Mean under strategy joint.*choose 0 or 1"),
+        ("separate", 0.5, "a whole number"),
+        ("pooled", 0.5, "a whole number"),
+    ],
+)
+def test_a_period_that_the_models_do_not_claim(runs, strategy, period, message):
+    run = open_run(folder_of(runs, strategy))
+    frame = run.scene().frames[0]
+    with pytest.raises(ConfigError, match=message):
+        run.render(frame.camera, frame.cam_from_world, period)
+
+
+@pytest.mark.parametrize(("strategy", "claims"), [("joint", True), ("separate", False)])
+def test_periods_in_between_need_a_continuous_method_that_saw_all(runs, strategy, claims):
+    run = open_run(folder_of(runs, strategy))
+    run = replace(run, spec=replace(run.spec, period_input="continuous"))
+    assert run.is_continuous == claims
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (SOURCE_FILE, None, "earlier version.*--overwrite"),
+        (SOURCE_FILE, "{}", "expected what bench wrote"),
+        (SOURCE_FILE, "[", "expected what bench wrote"),
+        (CONFIG_FILE, None, "expected the config of the run"),
+        (CONFIG_FILE, "{}", "expected the config of the run"),
+        (CONFIG_FILE, '{"config": {"method_config": {"of": "another"}}}', "mean: configuration"),
+        ("run.json", None, "expected a finished run"),
+        ("checkpoint/model.json", None, "model"),
+    ],
+)
+def test_missing_and_damaged_files(runs, name, text, message):
+    folder = folder_of(runs)
+    (folder / name).unlink()
+    if text is not None:
+        (folder / name).write_text(text)
+    with pytest.raises((CheckpointError, ConfigError, FileNotFoundError), match=message):
+        open_run(folder).model(0)
+
+
+@pytest.mark.parametrize("stage", [None, 0])
+def test_each_stage_of_a_sequential_run_can_be_opened(bench_here, stage):
+    outcome, _ = bench_here("chronogs", strategies=("sequential",), preset="fast", iterations=12)
+    folder = outcome.finished[0]
+    run = open_run(folder, stage=stage)
+    if stage is None:
+        assert_renders_its_predictions(run)
+        assert run.num_periods == 2
+        return
+    with pytest.raises(ConfigError, match=r"period 1: expected one from 0 to 0.*0 .spring."):
+        run.render(run.scene().frames[0].camera, np.eye(4), 1)
+    place = folder / "stages/period-0"
+    frames = {frame.name: frame for frame in run.scene().frames}
+    for entry in read_manifest(place).images:
+        frame = frames[entry.view]
+        image = run.render(frame.camera, frame.cam_from_world, entry.rendered_period).rgb
+        np.testing.assert_array_equal(to_bytes(image), load_image(place, entry))
+    with pytest.raises(ConfigError, match="stage 2: expected one from 0 to 1"):
+        open_run(folder, stage=2)
+
+
+def test_a_run_that_is_not_in_stages_has_none(runs):
+    with pytest.raises(
+        ConfigError, match="stage 0: expected a run in stages, found strategy joint"
+    ):
+        open_run(folder_of(runs), stage=0)
+
+
+def test_a_run_without_its_model(runs):
+    folder = folder_of(runs, "separate")
+    (folder / "checkpoint" / "period-1").rename(folder / "elsewhere")
+    run = open_run(folder)
+    run.model(0)
+    with pytest.raises(CheckpointError, match="period-1: expected the model of the run"):
+        run.model(1)
