@@ -144,7 +144,7 @@ def test_validate_wants_one_scene(in_folder):
         ({"scenes": "nowhere"}, "nowhere: expected"),
     ],
 )
-def test_benchmark_refuses_before_it_trains(in_folder, wrong, message):
+def test_bench_refuses_before_it_trains(in_folder, wrong, message):
     right = {"scenes": "data/plaza", "methods": "chronogs", "out": "runs"}
     with pytest.raises(cs.ChronoSceneError, match=message):
         cs.bench(**right | wrong)
