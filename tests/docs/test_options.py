@@ -1,0 +1,48 @@
+"""Options of commands and methods, and presets, that pages name exist."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import click
+import pytest
+
+from chronoscene.cli import COMMANDS, cli
+from chronoscene.methods import installed_methods, load_spec, options_of
+
+ROOT = Path(__file__).parents[2]
+PAGES = subprocess.run(
+    ["git", "-C", str(ROOT), "ls-files", "docs", "README.md", "baselines", "benchmarks"],
+    capture_output=True,
+    text=True,
+    check=True,
+).stdout.splitlines()
+SPECS = {name: load_spec(name) for name in installed_methods()}
+OPTIONS = {option.name for spec in SPECS.values() for option in options_of(spec)}
+GROUP = click.Context(cli)
+COMMAND_OPTIONS = {
+    name: {option for p in cli.get_command(GROUP, name).params for option in p.opts}
+    for name in COMMANDS
+}
+PRESETS = {preset for spec in SPECS.values() for preset in spec.presets}
+
+
+MARKDOWN = [page for page in PAGES if page.endswith(".md")]
+
+
+@pytest.mark.parametrize("page", MARKDOWN)
+def test_options_of_commands_exist(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8").replace("\\\n", " ")
+    for command, rest in re.findall(r"chronoscene ([a-z-]+)( [^`\n#]*)?", text):
+        if command in COMMANDS:
+            named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest))
+            assert named - {"--help"} <= COMMAND_OPTIONS[command], command
+
+
+@pytest.mark.parametrize("page", MARKDOWN)
+def test_options_and_presets_exist(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    options = {name.rpartition(".")[2] for name in re.findall(r"--set\s+'?([\w.-]+)=", text)}
+    assert options - {"NAME", "METHOD.NAME", "key", "KEY"} <= OPTIONS
+    presets = set(re.findall(r"--preset\s+([\w-]+)", text))
+    assert presets - {"NAME", "TEXT", "demo"} <= PRESETS  # The demo scene is a preset of synth
