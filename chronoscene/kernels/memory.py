@@ -60,7 +60,8 @@ def emit_store(builder: Any, value: Any, address: Any) -> None:
 def _make_read(number: types.Type, element: ir.Type) -> Callable:
     @emitted(lambda memory, index: number(memory, types.intp))
     def read(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(emit_address(context, builder, sig.args[0], *args, element=element))
+        memory, index = args
+        return builder.load(emit_address(context, builder, sig.args[0], memory, index, element))
 
     return read
 
@@ -68,8 +69,9 @@ def _make_read(number: types.Type, element: ir.Type) -> Callable:
 def _make_write(number: types.Type, element: ir.Type) -> Callable:
     @emitted(lambda memory, index, value: types.void(memory, types.intp, number))
     def write(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = emit_address(context, builder, sig.args[0], *args[:2], element=element)
-        builder.store(args[2], address)
+        memory, index, value = args
+        address = emit_address(context, builder, sig.args[0], memory, index, element)
+        builder.store(value, address)
 
     return write
 

@@ -151,10 +151,8 @@ def _edit(
         verb = CHANGE_VERBS.get(kind, "change")
     bounds = np.stack([p.bounds for p in meshes])
     low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
-    labels = (None if state is None else _label(state) for state in (before, after))
-    return Edit(
-        period, verb, name, kind, *labels, bounds=(tuple(low.tolist()), tuple(high.tolist()))
-    )
+    old, new = (None if state is None else _label(state) for state in (before, after))
+    return Edit(period, verb, name, kind, old, new, (tuple(low.tolist()), tuple(high.tolist())))
 
 
 SITE = ("lot", "foundation", "frame_low", "frame_high", "finished")
