@@ -43,7 +43,7 @@ class MethodConfig(Options, Protocol):
 
 def build_config(
     spec: MethodSpec, *, preset: str, overrides: Mapping[str, Any] | None = None
-) -> Any:
+) -> MethodConfig:
     """Make the frozen config of a method from a preset and values given by the user.
 
     Text is read as the annotation of the option asks for, so ``--set`` can pass it as typed.
@@ -57,10 +57,11 @@ def build_config(
     for key, value in (overrides or {}).items():
         check_choice(f"{spec.name} --set", key, adapters)
         values[key] = _parsed(f"{spec.name} --set {key}", value, adapters[key])
-    return config_class(**values)
+    config: MethodConfig = config_class(**values)
+    return config
 
 
-def config_from_values(spec: MethodSpec, values: Mapping[str, Any]) -> Any:
+def config_from_values(spec: MethodSpec, values: Mapping[str, Any]) -> MethodConfig:
     """Make the frozen config of a method from all of its values, as JSON gives them back.
 
     Raises:

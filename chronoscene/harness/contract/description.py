@@ -64,7 +64,7 @@ def presets_build_a_frozen_config(subject: Subject) -> None:
         )  # fmt: skip
         demand(json.loads(json.dumps(dataclasses.asdict(config))), place, "what JSON can hold")
         try:
-            config.iterations = 1
+            config.iterations = 1  # type: ignore[misc]
         except dataclasses.FrozenInstanceError:
             continue
         raise refuse(place, "a frozen dataclass", "one that can be changed")

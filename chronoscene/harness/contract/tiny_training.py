@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from chronoscene.images.store import ImageStore
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import (
     Method,
+    MethodConfig,
     MethodSpec,
     StepReport,
     TrainingSet,
@@ -87,7 +87,7 @@ def periods_for(spec: MethodSpec) -> int:
     return 1 if spec.period_input == "none" else 3
 
 
-def small_config(spec: MethodSpec) -> Any:
+def small_config(spec: MethodSpec) -> MethodConfig:
     """Return the config for short trainings."""
     preset = "fast" if "fast" in spec.presets else sorted(spec.presets)[0]
     return build_config(spec, preset=preset, overrides={"iterations": STEPS})

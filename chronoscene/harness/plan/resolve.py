@@ -12,7 +12,14 @@ from chronoscene.harness.files.provenance import config_hash
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.settings import SHARING, RunSettings
 from chronoscene.harness.plan.stop import StopRule
-from chronoscene.methods import MethodSpec, ProgramConfig, as_typed, build_config, load_spec
+from chronoscene.methods import (
+    MethodConfig,
+    MethodSpec,
+    ProgramConfig,
+    as_typed,
+    build_config,
+    load_spec,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +31,7 @@ class ResolvedMethod:
     spec: MethodSpec
     settings: RunSettings
     """Their overrides are those of this method."""
-    config: Any
+    config: MethodConfig
     preset: dict[str, Any]
     """Options of the preset that decide the result."""
 
@@ -58,7 +65,7 @@ class ResolvedRun:
 
     job: Job
     spec: MethodSpec
-    config: Any
+    config: MethodConfig
     """Frozen configuration of the method."""
     stop: StopRule
     """Number of iterations of the configuration, unless there is a time budget and no number."""
@@ -66,7 +73,7 @@ class ResolvedRun:
     """Everything that decides the result; written beside it as ``config.json``."""
 
     @classmethod
-    def of(cls, job: Job, spec: MethodSpec, config: Any) -> ResolvedRun:
+    def of(cls, job: Job, spec: MethodSpec, config: MethodConfig) -> ResolvedRun:
         """Derive the end of the run and its document."""
         settings = job.settings
         stop = StopRule(int(config.iterations), settings.budget_seconds)
@@ -116,7 +123,7 @@ def resolve(job: Job) -> ResolvedRun:
     return ResolvedRun.of(job, spec, _config(spec, job.settings))
 
 
-def _config(spec: MethodSpec, settings: RunSettings) -> Any:
+def _config(spec: MethodSpec, settings: RunSettings) -> MethodConfig:
     overrides: dict[str, Any] = dict(settings.overrides)
     if settings.iterations is not None:
         overrides["iterations"] = settings.iterations
@@ -132,7 +139,7 @@ def _config(spec: MethodSpec, settings: RunSettings) -> Any:
     return config
 
 
-def deciding_options(config: Any) -> dict[str, Any]:
+def deciding_options(config: MethodConfig) -> dict[str, Any]:
     """Return the options of a method that its result depends on: all, but places of a program."""
     options = dataclasses.asdict(config)
     places = ("prefix", "source") if isinstance(config, ProgramConfig) else ()

@@ -41,7 +41,7 @@ from chronoscene.io.processes import Report
 from chronoscene.io.programs import Usage, log_lines, run_program
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import shown
-from chronoscene.methods import Runner, import_object
+from chronoscene.methods import ProgramConfig, Runner, import_object
 from chronoscene.scene import Frame, Period, Scene
 
 LOG = "program.log"
@@ -116,6 +116,7 @@ def _run_part(
 ) -> Trained:
     """Train one model and import its images."""
     job, spec, config = run.job, run.spec, run.config
+    assert isinstance(config, ProgramConfig)  # planning has checked it
     staging = Path(job.staging)
     work, log = staging / WORK, staging / LOG
     data, output = work / "data", work / "output"

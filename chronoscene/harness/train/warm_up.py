@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 from chronoscene.harness.train.loop import Clock, seed_everything
 from chronoscene.harness.train.painted_balls import make_training_set
-from chronoscene.methods import Method, MethodSpec, import_object
+from chronoscene.methods import Method, MethodConfig, MethodSpec, import_object
 
 WARM_UP_STEPS = 120  # Enough for the first rounds of densification of the methods here
 WARM_UP_SECONDS = 3.0  # Limit on the time for the steps after the first three
 
 
 def warm_up(
-    spec: MethodSpec, config: Any, *, num_periods: int, device: str, now: Clock = time.perf_counter
+    spec: MethodSpec,
+    config: MethodConfig,
+    *,
+    num_periods: int,
+    device: str,
+    now: Clock = time.perf_counter,
 ) -> str | None:
     """Train a few steps on painted balls and render once; return an error message or None.
 

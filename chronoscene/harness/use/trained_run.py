@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from chronoscene.images.store import ImageStore
 from chronoscene.kernels.runtime import check_device
 from chronoscene.methods import (
     Method,
+    MethodConfig,
     MethodSpec,
     Prediction,
     View,
@@ -55,7 +55,7 @@ class TrainedRun:
     """Content of ``run.json``; for an earlier stage, its periods are those so far."""
     spec: MethodSpec
     source: RunSource
-    config: Any
+    config: MethodConfig
     """Configuration of the method."""
     training_from_world: Sim3
     device: str
