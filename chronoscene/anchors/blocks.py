@@ -51,14 +51,17 @@ def pack_blocks(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Order blocks by anchor, and replace their rows by the periods that share them.
 
     Returns:
-        tensors: ``block_leaders`` uint8 [A, T] in place of ``block_rows``: the first of the periods
-            that have the same block. Left out where nobody shares.
+        tensors: ``block_leaders`` in place of ``block_rows``: the first of the periods that have
+            the same block. Left out where nobody shares. [A, T], uint8, or int32 for T > 256.
     """
     rows, others = tensors["block_rows"], {n: t for n, t in tensors.items() if n != "block_rows"}
     first = leaders(rows)
     own = _leads(first)
     others["blocks"] = tensors["blocks"].detach()[rows[own]]
-    return others if own.all() else others | {"block_leaders": first.to(torch.uint8)}
+    if own.all():
+        return others
+    small = first.shape[1] <= torch.iinfo(torch.uint8).max + 1
+    return others | {"block_leaders": first.to(torch.uint8 if small else torch.int32)}
 
 
 def unpack_blocks(tensors: dict[str, Tensor], periods: int) -> dict[str, Tensor]:

@@ -47,6 +47,16 @@ def test_what_is_stored_comes_back(anchors: int, periods: int, seed: int) -> Non
     assert torch.equal(leaders(restored["block_rows"]), leaders(rows))
 
 
+@pytest.mark.parametrize("periods", [256, 257, 1000])
+def test_many_periods_are_stored_as_few(periods: int) -> None:
+    count, rows = shared_rows(3, periods, seed=0)
+    tensors = {"anchors": torch.zeros(3, 3), "blocks": torch.arange(count)[:, None]}
+    stored = pack_blocks(tensors | {"block_rows": rows})
+    assert stored["block_leaders"].dtype == (torch.uint8 if periods == 256 else torch.int32)
+    restored = unpack_blocks(stored, periods)
+    assert torch.equal(restored["blocks"][restored["block_rows"]], tensors["blocks"][rows])
+
+
 @pytest.mark.parametrize("first", [[[0, 0, 9]], [[1, 1, 0]]])
 def test_damaged_files_are_refused(first: list[list[int]]) -> None:
     stored = {

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.util import find_spec
-from itertools import chain
+from itertools import chain, combinations
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,22 @@ def _wrong(path: Path, found: str) -> ConfigError:
     )
 
 
+def _check_different(plans: Mapping[str, Plan]) -> None:
+    """Refuse rows whose configurations are equal: a table of their differences says nothing.
+
+    Raises:
+        ConfigError: If there are such.
+    """
+    for (label, plan), (other, same) in combinations(plans.items(), 2):
+        if plan.runs.keys() & same.runs.keys():
+            raise ConfigError(
+                f"study: rows {label!r} and {other!r}",
+                expected="runs of different settings",
+                found="equal ones, with this preset and these overrides",
+                todo="use another --preset, leave --set out, or correct the study",
+            )
+
+
 def run_study(
     study: Study, settings: BenchSettings, log: Log, *, execute: Execute | None = None
 ) -> tuple[BenchOutcome, dict[str, list[Path]]]:
@@ -164,6 +180,7 @@ def run_study(
             )
             asked = replace(settings, methods=(method,), strategies=(row.strategy,), run=changed)
             plans[row.label] = plan_runs(asked, once)
+        _check_different(plans)
         plan = Plan({}, {})
         for row_plan in plans.values():
             plan.runs.update(row_plan.runs)

@@ -1,5 +1,6 @@
 """Studies: the file, what is run, and that those which come with methods can be run."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -107,6 +108,12 @@ def test_a_row_that_cannot_be_run_is_found_before_anything_is_trained(
     assert not list(tmp_path.glob("runs/*/*/seed0"))
 
 
+def test_rows_that_are_equal_are_refused(study_file, scene_folder, tmp_path):
+    study = read_study(study_file(TWO_ROWS.replace("rate = 0.01", "rate = 0.5")))
+    with pytest.raises(ConfigError, match="rows 'slow' and 'fast': expected runs of different"):
+        run(study, scene_folder, tmp_path)
+
+
 def test_an_option_for_a_method_that_is_not_in_the_study(study_file, scene_folder, tmp_path):
     study = read_study(study_file(TWO_ROWS))
     with pytest.raises(ConfigError, match="'blind'"):
@@ -130,6 +137,21 @@ def test_shipped_rows_have_options_that_exist(name):
         spec = load_spec(row.method or study.method)
         for preset in ("paper", "fast", "balanced"):
             build_config(spec, preset=preset, overrides=row.options)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_rows_differ_under_each_preset(name):
+    """A feature that is trimmed to what the scene requires has one length in all rows."""
+    study = SHIPPED[name]
+    for preset in ("paper", "fast", "balanced"):
+        seen = []
+        for row in study.rows:
+            spec = load_spec(row.method or study.method)
+            config = asdict(build_config(spec, preset=preset, overrides=row.options))
+            if config.get("trim_global"):
+                config["global_dim"] = bool(config["global_dim"])
+            assert (row.strategy, spec.name, config) not in seen
+            seen.append((row.strategy, spec.name, config))
 
 
 def test_features_that_are_added_have_one_length():
