@@ -118,7 +118,7 @@ def test_all_runs_end_with_their_bench(number, scene_folder, tmp_path, monkeypat
     monkeypatch.setenv("TOY_HOLD", f"0:{scene_folder}")  # for ever
     process = subprocess.Popen([sys.executable, "-c", SCRIPT, str(scene_folder), str(runs)])
     try:
-        wait_for(lambda: len(list(runs.rglob(".seed0.*.partial/config.json"))) == 2)
+        wait_for(lambda: len(list(runs.glob("ring/*/.seed0.*.partial/config.json"))) == 2)
         started = process_tree([process.pid])
         assert len(started) == 3
     finally:

@@ -171,7 +171,7 @@ def test_runs_end_with_their_bench(number, on_ray, cluster, scene_folder, tmp_pa
         [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs), cluster.address]
     )
     try:
-        wait_for(lambda: len(list(runs.rglob(".seed7.*.partial/config.json"))) == 2)
+        wait_for(lambda: len(list(runs.glob("ring/*/.seed7.*.partial/config.json"))) == 2)
         started = workers()
     finally:
         driver.send_signal(number)
