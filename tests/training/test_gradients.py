@@ -9,7 +9,7 @@ from chronoscene.training.gradients import BackwardPass, collect_gradients
 
 
 def backward(factor, radius=1, mask=None):
-    """Of a loss whose gradient in the means is 2, and in the opacities not finite."""
+    """Gradients of a loss: 2 in the means, not finite in the opacities."""
     leaves = {name: torch.zeros(3, requires_grad=True) for name in ("means", "opacities")}
     loss = 1.0 + 2.0 * leaves["means"].sum() + factor * leaves["opacities"].square().sum().sqrt()
     info = SimpleNamespace(radii=torch.full((1, 4, 2), radius))

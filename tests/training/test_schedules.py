@@ -1,4 +1,4 @@
-"""How a learning rate falls."""
+"""Learning rates over a training."""
 
 import numpy as np
 import pytest

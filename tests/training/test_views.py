@@ -1,4 +1,4 @@
-"""Which view comes next, and how large its photo is."""
+"""Order of the views, and sizes of their photos."""
 
 import numpy as np
 import pytest

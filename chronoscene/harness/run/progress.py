@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from chronoscene.io.log import Log
 from chronoscene.io.processes import Report
 from chronoscene.io.wording import format_time
 
@@ -20,11 +21,9 @@ KNOWN = 0.1  # Share of a run after which the time left is shown: before, it mos
 class RunsDisplay:
     """Shows how many of several runs at a time have ended, their rate, and the time left."""
 
-    def __init__(
-        self, total: int, say: Callable[[str], None], console: Console | None = None
-    ) -> None:
+    def __init__(self, total: int, log: Log, console: Console | None = None) -> None:
         self._total, self._ended = total, 0
-        self._say = say
+        self._log = log
         self._shares: dict[str, float] = {}
         self._began = time.monotonic()
         self._lock = threading.Lock()
@@ -47,12 +46,12 @@ class RunsDisplay:
     def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Print a line above the bar."""
         if self._live:
             self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
         else:
-            self._say(line)
+            self._log(line)
 
     @contextmanager
     def showing(self, label: str) -> Iterator[Report]:
@@ -68,7 +67,7 @@ class RunsDisplay:
 
     def _update(self, label: str, what: str, done: int, total: int) -> None:
         if not total:
-            self.say(what)
+            self.log(what)
             return
         self._shares[label] = done / total
         self._show()
@@ -79,7 +78,7 @@ class RunsDisplay:
             line = self.status(done)
             self._bar.update(self._task, completed=done, description=line)
         if plain and not self._live:
-            self._say(line)
+            self._log(line)
 
     def status(self, done: float) -> str:
         """Describe the progress in one line; ``done`` counts shares of unfinished runs, too."""

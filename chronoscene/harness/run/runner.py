@@ -127,10 +127,10 @@ def _run_in_pool(
 
         def locked(run: ResolvedRun, lock: Lock) -> None:
             with lock, display.showing(run.job.label) as report:
-                carry_out(run, partial(pool.run, report=report), display.say)
+                carry_out(run, partial(pool.run, report=report), display.log)
 
         try:
-            for run, lock in _in_turn(todo, display.say):
+            for run, lock in _in_turn(todo, display.log):
                 under_way.add(threads.submit(locked, run, lock))
                 while len(under_way) == pool.at_once:
                     under_way = _without_ended(under_way)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from chronoscene.arrays import Ints, Mask
 from chronoscene.errors import ChronoSceneError
@@ -84,6 +83,8 @@ def common_points(seen: Mask) -> Ints:
 
 def connected(common: Ints, minimum: int) -> list[Ints]:
     """Groups of periods linked by chains of at least ``minimum`` common points, as indices."""
+    from scipy.sparse.csgraph import connected_components  # takes 0.2 s, which --help need not
+
     count, group = connected_components(common >= minimum, directed=False)
     return [np.flatnonzero(group == i) for i in range(count)]
 
