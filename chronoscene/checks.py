@@ -32,6 +32,11 @@ def check_choice(
     names = sorted(known)
     if value in names:
         return value
-    close = get_close_matches(value, names, n=1)
-    hint = f"did you mean {close[0]!r}?" if close else "choose one of them"
+    hint = nearest(value, names, otherwise="choose one of them")
     raise error(place, expected=f"one of {', '.join(names)}", found=repr(value), todo=hint)
+
+
+def nearest(value: str, known: Sequence[str], *, otherwise: str) -> str:
+    """Return advice that names the known word most like a value, or else the other advice."""
+    close = get_close_matches(value, known, n=1)
+    return f"did you mean {close[0]!r}?" if close else otherwise

@@ -15,14 +15,13 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
 from textwrap import dedent
 from typing import Any, ClassVar, Protocol, get_type_hints
 
 from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
-from chronoscene.checks import check_choice
+from chronoscene.checks import check_choice, nearest
 from chronoscene.errors import ConfigError
 from chronoscene.methods.spec import MethodSpec, import_object
 
@@ -138,12 +137,11 @@ def _refusal(place: str, error: ValidationError) -> ConfigError:
     expected = _EXPECTED.get(finding["type"], finding["msg"].removeprefix("Input should be "))
     expected = re.sub("^(greater|less) than", r"a value \g<0>", expected)
     known = re.findall(r"'([^']*)'", expected) if finding["type"] == "literal_error" else []
-    close = get_close_matches(str(finding["input"]), known, n=1)
     return ConfigError(
         place,
         expected=expected,
         found=repr(finding["input"]),
-        todo=f"did you mean {close[0]!r}?" if close else "correct the value",
+        todo=nearest(str(finding["input"]), known, otherwise="correct the value"),
     )
 
 

@@ -37,6 +37,11 @@ class Plan:
     todo: dict[Path, ResolvedRun]
     """Runs without a result when the plan was made."""
 
+    def update(self, other: Plan) -> None:
+        """Add the runs of another plan; a folder has one run."""
+        self.runs.update(other.runs)
+        self.todo.update(other.todo)
+
 
 def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     """Resolve and check all runs asked for; freezes the ground truth of the scenes."""
@@ -62,8 +67,7 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
         digest = next(iter(runs.values())).job.scene_hash
         freeze_ground_truth(shared.runs, scene, digest, store, shared.max_width)
         notices.update(dict.fromkeys(chain(*(run.job.notices for run in runs.values()))))
-        plan.runs.update(runs)
-        plan.todo.update(todo)
+        plan.update(Plan(runs, todo))
     for notice in notices:
         log(f"note: {notice}")
     return plan

@@ -183,8 +183,7 @@ def run_study(
         _check_different(plans)
         plan = Plan({}, {})
         for row_plan in plans.values():
-            plan.runs.update(row_plan.runs)
-            plan.todo.update(row_plan.todo)
+            plan.update(row_plan)
         outcome = run_plan(plan, settings, log, execute=execute, pool=pool)
     finished = {
         label: [folder for folder in rows.runs if (folder / RUN_FILE).is_file()]
