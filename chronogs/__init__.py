@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from chronoscene.anchors import MAIN_OPTIONS
-from chronoscene.methods import MethodSpec
+from chronoscene.anchors import MAIN_OPTIONS, SEARCH
+from chronoscene.methods import MethodSpec, Range
 
 _FULL: dict[str, Any] = {
     "length_unit": "training",
@@ -72,6 +72,13 @@ SPEC = MethodSpec(
         "balanced": _SHORT | {"iterations": 3_000},
         "accurate": _SHORT | {"iterations": 8_000},
     },
+    titles={"full": "ChronoGS, sizes of the paper"},
     resumable=True,
     main_options=(*MAIN_OPTIONS, "period_dim", "global_dim", "exposure"),
+    search={
+        **SEARCH,
+        "color_lr": Range(0.2, 5.0),
+        "period_dim": Range(2, 32, "int"),
+        "unused_share": Range(0.0, 0.1, "linear"),
+    },
 )

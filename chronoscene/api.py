@@ -14,17 +14,15 @@ from typing import TYPE_CHECKING
 from chronoscene.checks import check_choice
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import read_scene
-from chronoscene.harness.files.records import ROWS_FILE, Failure
-from chronoscene.harness.files.strategies import STRATEGIES
+from chronoscene.harness.files.records import ROWS_FILE, Failure, read_with_rows
 from chronoscene.harness.plan.settings import BenchSettings, RunSettings
 from chronoscene.harness.plan.stop import parse_duration
-from chronoscene.harness.report.summary import ENTRY_COLUMNS, read_with_rows, summarise
+from chronoscene.harness.report.summary import ENTRY_COLUMNS, summarise
 from chronoscene.harness.run.runner import run_bench
 from chronoscene.harness.score.views import PredictedView
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.log import Log
-from chronoscene.kernels.runtime import check_device
 from chronoscene.methods import as_typed
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
@@ -202,13 +200,14 @@ def bench(
     methods: str | Sequence[str],
     *,
     out: str | Path,
-    preset: str = "balanced",
+    preset: str | Path = "balanced",
     iterations: int | None = None,
     budget: str | float | None = None,
     seeds: Sequence[int] = (0,),
     strategies: str | Sequence[str] = "joint",
     overrides: Mapping[str, object] | None = None,
     max_width: int = MAX_WIDTH,
+    validation: bool = False,
     device: str = "auto",
     threads: int | None = None,
     jobs: int | None = None,
@@ -226,7 +225,7 @@ def bench(
         scenes: Folders of scenes, or one of them.
         methods: Names, or ``module:SPEC``.
         out: Folder of runs.
-        preset: Preset of the methods.
+        preset: Preset of the methods, or the path of a preset file.
         iterations: Training steps; None for those of the preset.
         budget: End of the training by the clock: seconds, or a text such as ``5m``. Schedules
             follow the clock then, and equal seeds do not give equal models.
@@ -234,6 +233,7 @@ def bench(
         strategies: One or several of ``joint``, ``pooled``, ``separate`` and ``sequential``.
         overrides: Options of the methods: ``key`` for all methods, ``method.key`` for one.
         max_width: Wider images are scaled down to this width in pixels.
+        validation: Hold blocks of the training views back and score these; test views are not read.
         device: ``auto``, ``cpu`` or ``cuda``.
         threads: Threads per run; None for all cores.
         jobs: Number of runs at a time; None for one.
@@ -250,14 +250,14 @@ def bench(
         >>> result = bench("data/plaza", ["chronogs", "3dgs"], out="runs", budget="90s")
         >>> result.table(["psnr"])
     """
-    check_device(device)
     run = RunSettings(
         Path(out),
-        preset=preset,
+        preset=str(preset),
         overrides={key: as_typed(value) for key, value in (overrides or {}).items()},
         iterations=iterations,
         budget_seconds=parse_duration(budget, "budget") if isinstance(budget, str) else budget,
         max_width=max_width,
+        validation=validation,
         threads=threads,
         device=device,
         period_by=period_by,
@@ -266,7 +266,7 @@ def bench(
         scenes=tuple(map(Path, [scenes] if isinstance(scenes, str | Path) else scenes)),
         methods=_several(methods),
         run=run,
-        strategies=tuple(check_choice("strategy", s, STRATEGIES) for s in _several(strategies)),
+        strategies=_several(strategies),
         seeds=tuple(seeds),
         dataset_format=format,
         overwrite=overwrite,

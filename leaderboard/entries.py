@@ -82,6 +82,8 @@ class EntryRun(BaseModel):
             raise ValueError("a view twice")
         if unknown := {name for view in self.views for name in view.values} - {*all_metrics()}:
             raise ValueError(f"unknown metrics: {', '.join(sorted(unknown))}")
+        if "validation=true" in record.variant.split(","):
+            raise ValueError("scores of validation views: run bench without --validation")
         if record.regions or record.stages or record.transfer:
             raise ValueError("regions and stages are no part of an entry")
         if not _agree((record.aggregates, record.periods), aggregate(self.rows)):
@@ -107,6 +109,8 @@ class MeasuredEntry(BaseModel):
 
     format_version: Literal[1] = 1
     kind: Literal["measured"] = "measured"
+    outdated: bool = False
+    """True for results of older code: its presets, or what it made of them, have changed since."""
     runs: tuple[EntryRun, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -125,8 +129,12 @@ class MeasuredEntry(BaseModel):
 
     @property
     def records(self) -> list[RunRecord]:
-        """Runs, with their rows."""
-        return [run.record.model_copy(update={"rows": run.rows}) for run in self.runs]
+        """Runs, with their rows; the title of a method says if its code is outdated."""
+        mark = " of older code" if self.outdated else ""
+        return [
+            run.record.model_copy(update={"rows": run.rows, "title": run.record.title + mark})
+            for run in self.runs
+        ]
 
 
 def read_entry(path: Path) -> MeasuredEntry:

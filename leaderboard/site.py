@@ -34,6 +34,7 @@ from leaderboard.entries import MeasuredEntry
 from leaderboard.groups import Setting, comparable, setting_of
 from leaderboard.pareto import Point, plot
 from leaderboard.pictures import find_runs, gallery
+from leaderboard.scenes import role_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -72,7 +73,7 @@ def write_site(
     """
     pictured = find_runs(runs, entries)
     with staged_folder(out) as staged:
-        _Site(entries, published, staged).write({r: e.record for r, e in pictured.items()})
+        _Site(entries, published, staged).write(pictured)
     return len(pictured)
 
 
@@ -84,6 +85,7 @@ class _Site:
     ) -> None:
         self.published, self.folder = published, folder
         self.records = [record for entry in entries for record in entry.records]
+        self.titles = {r.record.method: r.record.title for entry in entries for r in entry.runs}
         printed = published_entries(published, dict.fromkeys(row.scene for row in published.rows))
         self.printed = printed.assign(method=printed.method.map(published.methods))
         self.parts = {row.scene: row.group for row in published.rows}
@@ -126,8 +128,7 @@ class _Site:
     def title_of(self, method: str) -> str:
         """Return the name of a method in tables."""
         printed = {name: title for title, name in self.published.methods.items()}
-        measured = {record.method: record.title for record in self.records}
-        return measured.get(method) or printed.get(method, method)
+        return self.titles.get(method) or printed.get(method, method)
 
     def _parts(self) -> Iterator[dict[str, Any]]:
         """Yield tables of the first page: PSNR of methods by scenes, one per part of a dataset."""
@@ -149,12 +150,7 @@ class _Site:
             yield {
                 "title": PARTS.get(group, group) or OTHER_SCENES,
                 "scenes": scenes,
-                "measured": [
-                    {"method": m, "label": label, "effort": effort, "cells": cells}
-                    for (m, label, effort, *_), cells in sorted(
-                        measured.items(), key=lambda item: _order(next(iter(item[1].values())))
-                    )
-                ],
+                "measured": _by_effort(measured),
                 "published": printed,
             }
 
@@ -228,6 +224,23 @@ class _Site:
             }
 
 
+def _by_effort(
+    measured: Mapping[tuple[Any, ...], dict[str, Any]],
+) -> dict[str, list[dict[str, Any]]]:
+    """Arrange the rows of the first page: efforts by their order, methods by their quality.
+
+    Args:
+        measured: Cells by scene, for each method, label and effort.
+    """
+    efforts: dict[str, list[dict[str, Any]]] = {}
+    for (method, label, effort, *_), cells in sorted(
+        measured.items(), key=lambda item: _order(next(iter(item[1].values())))
+    ):
+        row = {"method": method, "label": label, "cells": cells}
+        efforts.setdefault(effort, []).append(row)
+    return dict(sorted(efforts.items(), key=lambda item: (len(item[0]), item[0])))
+
+
 def spec_of(method: str) -> MethodSpec | None:
     """Load the spec of an installed method; nothing that an entry names is imported."""
     return load_spec(method) if method in installed_methods() else None
@@ -274,6 +287,7 @@ def _group(
         "setting": setting,
         "plots": [p for p in plots if p is not None],
         "legend": legend,
+        "role": role_of(setting.scene_hash),
         "devices": list(dict.fromkeys(run.device for run in runs)),
         "commits": list(dict.fromkeys(run.commit[:10] for run in runs)),
     }

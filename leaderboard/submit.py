@@ -51,7 +51,8 @@ def submit(folders: Iterable[Path], to: Path) -> list[Path]:
         path = places.setdefault(entry.key, to / file_name(entry))
         known = entries.get(path, entry)
         by_seed = {run.record.seed: run for run in (*known.runs, *entry.runs)}
-        entries[path] = MeasuredEntry(runs=tuple(by_seed[seed] for seed in sorted(by_seed)))
+        runs = tuple(by_seed[seed] for seed in sorted(by_seed))
+        entries[path] = MeasuredEntry(outdated=known.outdated, runs=runs)
         changed[path] = entries[path]
     for path, entry in changed.items():
         path.parent.mkdir(parents=True, exist_ok=True)

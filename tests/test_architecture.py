@@ -15,7 +15,7 @@ LAYERS = (
     ("chronoscene.cli",),
     ("chronoscene.api",),
     ("leaderboard",),
-    ("chronoscene.harness.study", "chronoscene.harness.contract"),
+    ("chronoscene.harness.study", "chronoscene.harness.contract", "chronoscene.harness.tune"),
     ("chronoscene.harness.run", "chronoscene.harness.train"),
     ("chronoscene.harness.report", "chronoscene.harness.use"),
     ("chronoscene.harness.score",),

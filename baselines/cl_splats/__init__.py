@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from chronoscene.gaussians import MAIN_OPTIONS
-from chronoscene.methods import MethodSpec
+from chronoscene.gaussians import MAIN_OPTIONS, SEARCH
+from chronoscene.methods import MethodSpec, Range
 
 _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousands
     "length_unit": "training",
@@ -19,7 +19,7 @@ _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousand
 
 SPEC = MethodSpec(
     name="cl-splats",
-    title="CL-Splats",
+    title="CL-Splats-style",
     paper="Ackermann et al., CL-Splats: Continual Learning of Gaussian Splatting with Local "
     "Optimization, ICCV 2025",
     licence="Apache-2.0 (written from descriptions of the paper; the official code is under the "
@@ -36,6 +36,13 @@ SPEC = MethodSpec(
         "balanced": _SHORT | {"iterations": 3_000, "reset_interval": 8_000},
         "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
     },
+    per_period=("paper", "paper-released"),
     resumable=True,
     main_options=(*MAIN_OPTIONS, "change_threshold", "dilation", "vote_share", "samples"),
+    search={
+        **SEARCH,
+        "sh_degree": Range(0, 3, "int"),
+        "exposure": ("none", "period"),
+        "samples": (0, 2_000),
+    },
 )

@@ -46,7 +46,7 @@ class CLSplatsTrainer(GaussianTrainer):
         while self.stage < due:
             exposure = self.exposure.by_period()
             self.begin_period(self.stages[self.stage + 1])
-            self._enter(self.stage + 1)
+            self._enter(self.stage + 1, index)
             if exposure is not None:
                 self.exposure.begin(exposure)
         start, end = self.bounds[self.stage : self.stage + 2]
@@ -55,11 +55,11 @@ class CLSplatsTrainer(GaussianTrainer):
             self._prune_strays()
         return replace(report, primitives=len(self.model) + len(self.model.kept["means"]))
 
-    def _enter(self, stage: int) -> None:
-        """Train on the views of another period; everything begins anew."""
+    def _enter(self, stage: int, begin: int) -> None:
+        """Train on the views of another period from a step on; everything begins anew."""
         self.stage, self.train = stage, self.stages[stage]
         self.model.period = self.train.views[0].period
-        self.timeline = self.timeline_class(self.config)
+        self.timeline = self.timeline_class(self.config, begin)
         self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
         self.exposure = Exposure(self.config.exposure, self.train, self.background.device)
         self.begin()
@@ -91,12 +91,12 @@ class CLSplatsTrainer(GaussianTrainer):
         exposure = self.exposure.by_period()  # also of periods that are over
         if exposure is not None:
             state.tensors[_EXPOSURES] = exposure
-        state.values["stage"] = self.stage
+        state.values.update(stage=self.stage, stage_begin=self.timeline.begin)
         return state
 
     def load_state(self, state: TrainingState) -> None:
         device = self.background.device
-        self._enter(state.values["stage"])
+        self._enter(state.values["stage"], state.values["stage_begin"])
         kept = parts(state.tensors, "kept")
         self.model.keep({name: tensor.to(device) for name, tensor in kept.items()})
         self.model.spheres = state.tensors["spheres"].to(device)

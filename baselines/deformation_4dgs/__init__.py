@@ -4,8 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
-from chronoscene.gaussians import MAIN_OPTIONS
-from chronoscene.methods import MethodSpec
+from chronoscene.gaussians import MAIN_OPTIONS, SEARCH
+from chronoscene.methods import MethodSpec, Range
+
+_SCALED: dict[str, Any] = {"length_unit": "training"}
+"""The rates of the released code grow with the extent of the cameras: in metres they may diverge,
+in the training frame they cannot depend on the unit."""
+
+_DEFAULTS: dict[str, Any] = {  # of the released command line, without a file of arguments
+    "iterations": 33_000,
+    "densify_until": 15_000,
+    "channels": 32,
+    "levels": 4,
+    "time_cells": 25,
+    "width": 64,
+    "deform_opacity": False,
+    "deform_color": False,
+    "space_smoothness": 1e-4,
+    "time_smoothness": 0.01,
+}
 
 _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousands
     "length_unit": "training",
@@ -42,10 +59,24 @@ SPEC = MethodSpec(
     config="baselines.deformation_4dgs.config:Deformation4DGSConfig",
     presets={
         "paper": {},
+        "paper-scaled": _SCALED,
+        "paper-defaults": _SCALED | _DEFAULTS,
         "accurate": _SHORT | _MEDIUM | {"iterations": 8_000},
         "balanced": _SHORT | _MEDIUM | {"iterations": 3_000, "reset_interval": 8_000},
         "fast": _SHORT | _SMALL | {"iterations": 1_000, "reset_interval": 30_000},
     },
+    titles={
+        "paper": "4DGS, official multi-view options",
+        "paper-scaled": "4DGS, official multi-view options, scaled",
+        "paper-defaults": "4DGS, official defaults, scaled",
+        **dict.fromkeys(("accurate", "balanced", "fast"), "4DGS, tuned"),
+    },
     resumable=True,
     main_options=(*MAIN_OPTIONS, "sh_degree", "coarse_until", "plane_size", "time_cells"),
+    search={
+        **SEARCH,
+        "field_lr_initial": Range(1.6e-4, 0.02),
+        "plane_lr_initial": Range(1.6e-3, 0.1),
+        "time_smoothness": Range(2e-6, 0.01),
+    },
 )

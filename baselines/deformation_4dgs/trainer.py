@@ -20,16 +20,17 @@ class TwoStages(Timeline):
 
     config: Deformation4DGSConfig
 
-    def is_fine(self, progress: float) -> bool:
+    def is_fine(self, index: int, progress: float) -> bool:
         """Return True if the second stage has begun."""
-        return super().moment(progress) > self.config.coarse_until
+        return super().moment(index, progress) > self.config.coarse_until
 
-    def moment(self, progress: float) -> int:
-        return super().moment(progress) - self.is_fine(progress) * self.config.coarse_until
+    def moment(self, index: int, progress: float) -> int:
+        before = self.config.coarse_until if self.is_fine(index, progress) else 0
+        return super().moment(index, progress) - before
 
     def at(self, index: int, progress: float) -> Due:
         config = self.config
-        degree = super().moment(progress) // config.sh_interval
+        degree = super().moment(index, progress) // config.sh_interval
         return replace(super().at(index, progress), sh_degree=min(config.sh_degree, degree))
 
 
@@ -45,7 +46,7 @@ class DeformationTrainer(GaussianTrainer):
     timeline_class = TwoStages
 
     def step(self, index: int, progress: float) -> StepReport:
-        if not self.model.is_deforming and self.timeline.is_fine(progress):
+        if not self.model.is_deforming and self.timeline.is_fine(index, progress):
             self.model.is_deforming = True
             self.begin()
         return super().step(index, progress)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from chronoscene.gaussians import MAIN_OPTIONS
-from chronoscene.methods import MethodSpec
+from chronoscene.gaussians import MAIN_OPTIONS, SEARCH
+from chronoscene.methods import MethodSpec, Range
 
 _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousands
     "length_unit": "training",
@@ -44,4 +44,10 @@ SPEC = MethodSpec(
     },
     resumable=True,
     main_options=(*MAIN_OPTIONS, "reference", "encoder", "width", "visibility"),
+    search={
+        **SEARCH,
+        "network_lr": Range(2e-4, 8e-3),
+        "coordinate_lr_initial": Range(1e-3, 1.0),
+        "reference": ("image", "period"),
+    },
 )

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from chronoscene.gaussians import MAIN_OPTIONS
-from chronoscene.methods import MethodSpec
+from chronoscene.gaussians import MAIN_OPTIONS, SEARCH
+from chronoscene.methods import MethodSpec, Range
 
 # The published schedule squeezed into thousands of steps; the set grows as far as it wants to.
 _SHORT: dict[str, Any] = {"length_unit": "training", "stretch": True}
@@ -36,6 +36,12 @@ SPEC = MethodSpec(
         "position_lr_initial",
         "ssim_weight",
     ),
+    search={
+        **SEARCH,
+        "scale_lr": Range(1e-3, 0.02),
+        "rotation_lr": Range(2e-4, 0.01),
+        "random_background": (False, True),
+    },
 )
 
 PERIOD_SPEC = replace(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from chronoscene.gaussians import MAIN_OPTIONS
-from chronoscene.methods import MethodSpec
+from chronoscene.gaussians import MAIN_OPTIONS, SEARCH
+from chronoscene.methods import MethodSpec, Range
 
 _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousands
     "length_unit": "training",
@@ -30,10 +30,17 @@ SPEC = MethodSpec(
     config="baselines.realtime_4dgs.config:Realtime4DGSConfig",
     presets={
         "paper": {},
+        "paper-scaled": {"length_unit": "training"},
         "accurate": _SHORT | {"iterations": 8_000, "reset_interval": 7_500},
         "balanced": _SHORT | {"iterations": 3_000, "reset_interval": 8_000},
         "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
     },
     resumable=True,
     main_options=(*MAIN_OPTIONS, "sh_degree", "start_times", "initial_time_scale", "wave_cycle"),
+    search={
+        **SEARCH,
+        "time_lr": Range(1.6e-4, 0.02),
+        "wave_dc_lr": Range(1e-4, 0.01),
+        "wave_cycle": (1.0, 2.0),
+    },
 )

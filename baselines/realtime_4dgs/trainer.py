@@ -18,7 +18,7 @@ class SpacetimeTrainer(GaussianTrainer):
     scatter = staticmethod(scatter_in_spacetime)
 
     def step(self, index: int, progress: float) -> StepReport:
-        config, moment = self.config, self.timeline.moment(progress)
+        config, moment = self.config, self.timeline.moment(index, progress)
         begin = config.sh_degree * config.sh_interval
         due = min(max(moment - begin, 0) // config.wave_interval, ORDERS)
         # Higher than what is due at the start of a training that goes on with a model.

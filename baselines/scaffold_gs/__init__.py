@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from chronoscene.anchors import MAIN_OPTIONS
-from chronoscene.methods import MethodSpec
+from chronoscene.anchors import MAIN_OPTIONS, SEARCH
+from chronoscene.methods import MethodSpec, Range
 
 _SHORT: dict[str, Any] = {
     "length_unit": "training",
@@ -36,6 +36,12 @@ SPEC = MethodSpec(
     presets=_PRESETS,
     resumable=True,
     main_options=(*MAIN_OPTIONS, "appearance_dim", "scale_weight", "exposure"),
+    search={
+        **SEARCH,
+        "color_lr": Range(0.2, 5.0),
+        "offsets_per_anchor": Range(3, 10, "int"),
+        "covariance_lr": Range(0.2, 5.0),
+    },
 )
 
 PERIOD_SPEC = replace(
@@ -45,5 +51,11 @@ PERIOD_SPEC = replace(
     period_input="continuous",
     method="baselines.scaffold_gs.method:ScaffoldGSPeriod",
     presets={name: {"appearance_dim": 32, **values} for name, values in _PRESETS.items()},
+    search={
+        **SEARCH,
+        "color_lr": Range(0.2, 5.0),
+        "offsets_per_anchor": Range(3, 10, "int"),
+        "appearance_dim": Range(0, 64, "int"),
+    },
 )
 """The obvious baseline that knows of time: an appearance vector per period instead of per image."""

@@ -1,16 +1,20 @@
 """Outcomes of trainings on extreme scenes.
 
-    python -m benchmarks.training.extremes [--write] [--extreme WORD ...] [--method NAME ...]
+    python -m benchmarks.training.extremes RESULTS [--write] [--threads N] [--extreme WORD ...]
+        [--method NAME ...] [--preset NAME ...]
 
-Trains every installed method on every extreme of tests/methods/support/extreme_trainings.py, and
-prints a table in Markdown. With --write it replaces the one in
-docs/experiments/training-extremes.md.
+Trains every installed method, with every preset, on every extreme of
+tests/methods/support/extreme_trainings.py, and prints a table in Markdown. RESULTS gets a line of
+JSON for each training; the same command goes on after the last one. With --write the table
+replaces the one in docs/experiments/training-extremes.md.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -30,44 +34,101 @@ extremes: Any = import_module("extreme_trainings")
 
 PAGE = ROOT / "docs" / "experiments" / "training-extremes.md"
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
-HEAD = ("extreme", "method", "steps", "outcome", "PSNR before, dB", "after, dB", "primitives")
+FIRST = ("fast", "paper")  # Presets that all extremes have before any other is tried
+RANKS = ("trained", "worse", "error", "traceback")
+"""Outcomes, best first; worse: than the model was at its start, by more than `TOLERANCE`."""
+TOLERANCE = 0.05  # dB
+
+Result = dict[str, Any]
 
 
-def row(extreme: Any, name: str) -> tuple[str, ...]:
-    """Cells of one training."""
-    outcome = extremes.run(extreme, load_spec(name))
-    reports = outcome.reports
-    worse = ", but worse than at its start" if outcome.after < outcome.before else ""
-    found = f"trained{worse}" if outcome.error is None else outcome.error
-    if not outcome.clear:
-        found = f"**traceback**: {found}"
-    for skipped in ("empty", "not finite"):
-        if count := sum(report.skipped == skipped for report in reports):
-            found += f"; {count} steps {skipped}"
-    primitives = f"{reports[-1].primitives:,}" if reports else ""
-    print(f"{extreme.name}, {name}: {outcome.seconds:.1f} s", file=sys.stderr, flush=True)
-    psnr = (f"{x:.1f}" for x in (outcome.before, outcome.after))
-    return (extreme.name, name, str(len(reports)), found, *psnr, primitives)
+def train(extreme: Any, name: str, preset: str) -> Result:
+    """Train once."""
+    outcome = extremes.run(extreme, load_spec(name), preset)
+    if outcome.error is not None:
+        rank = "error" if outcome.clear else "traceback"
+    else:
+        rank = "worse" if outcome.after < outcome.before - TOLERANCE else "trained"
+    return {
+        "extreme": extreme.name,
+        "method": name,
+        "preset": preset,
+        "outcome": rank,
+        "error": outcome.error,
+        "steps": len(outcome.reports),
+        "empty": sum(report.skipped == "empty" for report in outcome.reports),
+        "not finite": sum(report.skipped == "not finite" for report in outcome.reports),
+        "before": repr(outcome.before),
+        "after": repr(outcome.after),
+        "primitives": outcome.reports[-1].primitives if outcome.reports else None,
+        "seconds": round(outcome.seconds, 1),
+        "commit": code_version(),
+    }
+
+
+def cell(results: Sequence[Result], presets: int, errors: list[str]) -> str:
+    """Text of the worst outcome of a method on an extreme; messages are appended to ``errors``."""
+    if not results:
+        return "not run"
+    worst = max((r["outcome"] for r in results), key=RANKS.index)
+    text = worst
+    if worst != "trained" or len(results) < presets:
+        text += f": {', '.join(r['preset'] for r in results if r['outcome'] == worst)}"
+    for message in dict.fromkeys(r["error"] for r in results if r["outcome"] == worst):
+        if message is not None:
+            if message not in errors:
+                errors.append(message)
+            text += f" [{errors.index(message) + 1}]"
+    return text if len(results) == presets else f"{text} ({len(results)} of {presets})"
+
+
+def table(results: Sequence[Result], chosen: Sequence[Any], names: Sequence[str]) -> str:
+    """Table of the worst outcomes in Markdown, and the errors below it."""
+    errors: list[str] = []
+    lines = [("extreme", *names), ("---",) * (len(names) + 1)]
+    for extreme in chosen:
+        cells = []
+        for name in names:
+            found = [r for r in results if (r["extreme"], r["method"]) == (extreme.name, name)]
+            cells.append(cell(found, len(load_spec(name).presets), errors))
+        lines.append((extreme.name, *cells))
+    rows = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    notes = "".join(f"{i}. {message}\n" for i, message in enumerate(errors, start=1))
+    return f"{rows}\n" + (f"\n{notes}" if notes else "")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--write", action="store_true", help=f"write it to {PAGE.name}")
+    parser.add_argument("results", type=Path, metavar="RESULTS", help="file to continue")
+    parser.add_argument("--write", action="store_true", help=f"write the table to {PAGE.name}")
+    parser.add_argument("--threads", type=int, help="of the kernels")
     parser.add_argument("--extreme", nargs="+", help="only extremes with one of these in the name")
     parser.add_argument("--method", nargs="+", default=method_names(), help="only these")
+    parser.add_argument("--preset", nargs="*", help="only these; none: only the table")
     args = parser.parse_args()
     keep_freed_memory()
-    threads = set_threads()
+    threads = set_threads(args.threads)
     chosen = [
         extreme
         for extreme in extremes.EXTREMES
         if args.extreme is None or any(word in extreme.name for word in args.extreme)
     ]
-    rows = [row(extreme, name) for extreme in chosen for name in args.method]
-    lines = [HEAD, ["---"] * 4 + ["---:"] * 3, *rows]
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    machine = f"{processor_name()}, {threads} threads, commit {code_version()}, seed 0."
-    text = f"{machine}\n\n{table}\n"
+    args.results.touch()
+    results = [json.loads(line) for line in args.results.read_text("utf-8").splitlines()]
+    done = {(r["extreme"], r["method"], r["preset"]) for r in results}
+    plan = [(e, n, p) for e in chosen for n in args.method for p in load_spec(n).presets]
+    plan = [(e, n, p) for e, n, p in plan if args.preset is None or p in args.preset]
+    for extreme, name, preset in sorted(plan, key=lambda run: run[2] not in FIRST):
+        if (extreme.name, name, preset) in done:
+            continue
+        results.append(train(extreme, name, preset))
+        with args.results.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(results[-1]) + "\n")
+        shown = (results[-1][key] for key in ("outcome", "seconds"))
+        print(f"{extreme.name}, {name}, {preset}:", *shown, file=sys.stderr, flush=True)
+    commits = ", ".join(dict.fromkeys(result["commit"][:7] for result in results))
+    machine = f"{processor_name()}, threads: {threads}, commit {commits or code_version()}, seed 0."
+    text = f"{machine}\n\n{table(results, chosen, args.method)}"
     if not args.write:
         print(text)
         return

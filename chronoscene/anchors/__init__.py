@@ -4,6 +4,10 @@ In: a `TrainingSet` and an `AnchorConfig`. Out: a trained `AnchorModel`, and `An
 base class of the plug-ins. `decode` holds the MLPs; what varies with the period, a method says.
 """
 
+from collections.abc import Mapping
+
+from chronoscene.methods import Range
+
 MAIN_OPTIONS = (
     "iterations",
     "max_anchors",
@@ -14,3 +18,15 @@ MAIN_OPTIONS = (
     "antialiased",
 )
 """Options shown first for each of these methods, followed by its own."""
+
+SEARCH: Mapping[str, tuple[bool, ...] | Range] = {
+    "antialiased": (False, True),
+    "offset_lr": Range(0.2, 5.0),
+    "opacity_lr": Range(0.2, 5.0),
+    "feature_lr": Range(0.2, 5.0),
+    "ssim_weight": Range(0.0, 0.5, "linear"),
+    "cooldown": Range(0.0, 0.4, "linear"),
+    "grad_threshold": Range(5e-5, 8e-4),
+    "density_interval": Range(20, 100, "int"),
+}
+"""Search space that all of these methods share; each has three options of its own besides."""

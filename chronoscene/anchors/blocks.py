@@ -47,6 +47,23 @@ def leaders(block_rows: Tensor) -> Tensor:
     return first[block_rows]
 
 
+def count_sharing(block_rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Count how the periods share blocks.
+
+    Args:
+        block_rows: Block of an anchor at a period. int64 [A, T]
+
+    Returns:
+        anchors: Anchors with 1, 2, ... T blocks. int64 [T]
+        alone: Blocks that each period has to itself. int64 [T]
+    """
+    periods = block_rows.shape[1]
+    blocks = _leads(leaders(block_rows)).sum(dim=1)
+    users = torch.bincount(block_rows.flatten())
+    anchors = torch.bincount(blocks, minlength=periods + 1)[1:]
+    return anchors, (users[block_rows] == 1).sum(dim=0)
+
+
 def pack_blocks(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Order blocks by anchor, and replace their rows by the periods that share them.
 
@@ -197,29 +214,58 @@ def agglomerate(
 
 @kernel(parallel=True)
 def _agglomerate(values, weights, limit, costs, first):  # type: ignore[no-untyped-def]
-    anchors, periods, dim = values.shape
+    # The best partner of each period among those before it is kept, so that a step takes time in
+    # proportion to the number of periods, mostly, and not to its square.
+    anchors, periods, _ = values.shape
     for a in prange(anchors):
+        best, partner = np.full(periods, np.inf), np.full(periods, -1)
+        for j in range(1, periods):
+            _find_partner(values[a], weights[a], first[a], j, best, partner)
         for step in range(periods - 1):
-            best, s, t = np.inf, -1, -1
+            t = -1
             for j in range(1, periods):
-                for i in range(j):
-                    if first[a, i] != i or first[a, j] != j:
-                        continue
-                    total = weights[a, i] + weights[a, j]
-                    squares = 0.0
-                    for f in range(dim):
-                        squares += (values[a, i, f] - values[a, j, f]) ** 2
-                    cost = weights[a, i] * weights[a, j] / total * squares if total > 0 else 0.0
-                    if cost < best or (cost == best and j - i < t - s):
-                        best, s, t = cost, i, j
-            if best > limit:
+                if partner[j] >= 0 and (
+                    t < 0
+                    or best[j] < best[t]
+                    or (best[j] == best[t] and j - partner[j] < t - partner[t])
+                ):
+                    t = j
+            if t < 0 or best[t] > limit:
                 break
-            costs[a, step] = best
+            s = partner[t]
+            costs[a, step] = best[t]
             total = weights[a, s] + weights[a, t]
             part = weights[a, t] / total if total > 0 else 0.0
-            for f in range(dim):
+            for f in range(values.shape[2]):
                 values[a, s, f] += part * (values[a, t, f] - values[a, s, f])
             weights[a, s] = total
             for period in range(periods):
                 if first[a, period] == t:
                     first[a, period] = s
+            partner[t] = -1
+            for j in range(s, periods):
+                if first[a, j] != j:
+                    continue
+                if j == s or partner[j] == s or partner[j] == t:
+                    _find_partner(values[a], weights[a], first[a], j, best, partner)
+                else:
+                    _compare_partner(values[a], weights[a], s, j, best, partner)
+
+
+@kernel(inline="always")
+def _compare_partner(values, weights, i, j, best, partner):  # type: ignore[no-untyped-def]
+    total = weights[i] + weights[j]
+    squares = 0.0
+    for f in range(values.shape[1]):
+        squares += (values[i, f] - values[j, f]) ** 2
+    cost = weights[i] * weights[j] / total * squares if total > 0 else 0.0
+    if cost < best[j] or (cost == best[j] and i > partner[j]):
+        best[j], partner[j] = cost, i
+
+
+@kernel
+def _find_partner(values, weights, first, j, best, partner):  # type: ignore[no-untyped-def]
+    best[j], partner[j] = np.inf, -1
+    for i in range(j):
+        if first[i] == i:
+            _compare_partner(values, weights, i, j, best, partner)

@@ -77,9 +77,6 @@ class AnchorConfig(SplattingConfig):
     """Learning rate of the MLP that gives scales and rotations."""
     color_lr: tuple[float, float] = (0.008, 0.00005)
     """Learning rate of the MLP that gives colours."""
-    cooldown: NonNegativeFloat = 0.0
-    """Share of the training, its last, in which all learning rates fall further, to a tenth of what
-    they would be: the model settles. Not in the papers."""
 
     # Growth and pruning
     statistics_from: float = 500 / 40_000

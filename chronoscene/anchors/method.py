@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.baking import bake
-from chronoscene.anchors.blocks import own_blocks, pack_blocks, unpack_blocks
+from chronoscene.anchors.blocks import count_sharing, own_blocks, pack_blocks, unpack_blocks
 from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.contribution import pack_offsets, unpack_offsets
 from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
 from chronoscene.anchors.model import FIXED, LAYERS, PER_ANCHOR, AnchorLayout, AnchorModel
 from chronoscene.anchors.trainer import AnchorTrainer
 from chronoscene.errors import CheckpointError
-from chronoscene.methods import TrainingSet, View
+from chronoscene.methods import PeriodSharing, TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
@@ -167,6 +167,20 @@ class AnchorMethod(SplattingMethod):
 
     def stored_tensors(self) -> dict[str, Tensor]:
         return pack_blocks(pack_offsets(self.model.tensors()))
+
+    def sharing(self) -> PeriodSharing | None:
+        """Count what periods share; None for one period, or without features that vary."""
+        model, exposure = self.model, self.exposure()
+        layout = model.layout
+        if layout.num_periods == 1 or not layout.period_dim:
+            return None
+        anchors, alone = count_sharing(model.block_rows)
+        common = int(anchors[0])
+        partly = (len(model.blocks) - common - int(alone.sum())) * layout.period_dim
+        further = layout.global_dim + (0 if exposure is None else exposure[0].numel())
+        own = tuple((alone * layout.period_dim + further).tolist())
+        shared = self.size().parameters - sum(own) - partly
+        return PeriodSharing(tuple(anchors.tolist()), own, partly, shared)
 
     def permute(self, order: NDArray[np.int64]) -> None:
         rows, tensors = torch.from_numpy(order), self._model.tensors()

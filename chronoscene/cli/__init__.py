@@ -37,8 +37,10 @@ COMMANDS = {
     "synth": "chronoscene.cli.scenes.synth:command",
     "table": "chronoscene.cli.report.results:table",
     "tradeoff": "chronoscene.cli.report.tradeoff:command",
+    "tune": "chronoscene.cli.runs.tune:command",
     "undistort": "chronoscene.cli.scenes.undistort:command",
     "validate": "chronoscene.cli.scenes.validate:command",
+    "verify": "chronoscene.cli.report.verify:command",
 }
 """Command name to ``module:attribute``."""
 

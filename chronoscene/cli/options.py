@@ -76,53 +76,63 @@ DEVICE = click.option(
     "--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="Device to render on."
 )
 
-_TRAINING = (
-    click.option("--preset", default="balanced", help="Preset of the methods."),
-    click.option(
+_TRAINING = {
+    "preset": click.option(
+        "--preset", default="balanced", help="Preset of the methods, or a file FILE.toml with one."
+    ),
+    "iterations": click.option(
         "--iterations", type=click.IntRange(min=1), help="Stop after this many iterations."
     ),
-    click.option("--seeds", type=click.IntRange(min=1), default=1, help="Number of seeds."),
-    click.option(
+    "seeds": click.option(
+        "--seeds", type=click.IntRange(min=1), default=1, help="Number of seeds."
+    ),
+    "assignments": click.option(
         "--set",
         "assignments",
         multiple=True,
         help="Set an option of the methods, as KEY=VALUE or METHOD.KEY=VALUE. May be repeated.",
     ),
-    click.option(
+    "jobs": click.option(
         "--jobs",
         type=click.IntRange(min=1),
         help="Number of runs at a time.  [default: 1; with --ray, as many as fit]",
     ),
-    click.option(
+    "job_memory": click.option(
         "--job-memory",
         type=click.FloatRange(min=0, min_open=True),
         callback=lambda _context, _option, value: value and round(value * 1e9),
         help="Memory of a run in GB: the next one starts if this much is free.  "
         "[default: an estimate]",
     ),
-    click.option(
+    "ray": click.option(
         "--ray",
         metavar="ADDRESS",
         help="Address of a Ray cluster to run on; auto for that of this machine.",
     ),
-    click.option(
+    "threads": click.option(
         "--threads",
         type=click.IntRange(min=1),
         help="Number of threads of a run.  [default: one per processor, divided by --jobs; "
         "with --ray, those of the smallest machine]",
     ),
-    click.option(
+    "device": click.option(
         "--device",
         type=click.Choice(["auto", "cpu", "cuda"]),
         default="auto",
         help="Device to train and render on.",
     ),
-)
+}
 
 
 def training_options(command: Any) -> Any:
     """Add the options that ``bench`` and ``study`` share."""
-    return reduce(lambda found, option: option(found), reversed(_TRAINING), command)
+    return add_options(*_TRAINING)(command)
+
+
+def add_options(*names: str) -> Callable[[Any], Any]:
+    """Add some of the options of trainings, by the names of their arguments."""
+    options = [_TRAINING[name] for name in reversed(names)]
+    return lambda command: reduce(lambda found, option: option(found), options, command)
 
 
 def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:

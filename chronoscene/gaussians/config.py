@@ -21,9 +21,9 @@ class GaussianConfig(SplattingConfig):
     iterations: PositiveInt = 30_000
     """Training steps; one image each."""
     stretch: bool = False
-    """False: moment i is step i, as published, so a training longer than `schedule_length` leaves
-    the schedule as it is. True: the whole schedule is stretched or squeezed to the length of the
-    training."""
+    """False: moment i is step i of the training of a model, or of a stage of it, as published:
+    however long the training, the schedule stays as it is. True: the whole schedule is stretched
+    or squeezed to the length of the training."""
     schedule_length: PositiveInt = 30_000
     """Moments that the schedule was made for; the learning rate of the positions falls over
     them."""

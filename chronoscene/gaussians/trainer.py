@@ -32,7 +32,7 @@ from chronoscene.training.gradients import collect_gradients, mask_tensor
 from chronoscene.training.losses import training_loss
 from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.photometric import photometric_loss
-from chronoscene.training.schedules import log_linear
+from chronoscene.training.schedules import cooled, log_linear
 from chronoscene.training.views import ViewSampler
 
 # Keep random choices of a kind apart from those of others with the same seed
@@ -47,6 +47,8 @@ class Due:
 
     moment: int
     """Iteration of the schedule, from 1."""
+    progress: float
+    """Share of the training that is over."""
     sh_degree: int
     position_lr: float
     """Learning rate of positions, not yet multiplied by the extent of the cameras."""
@@ -58,22 +60,27 @@ class Due:
 
 
 class Timeline:
-    """Turns steps and progress into what is due, each event once."""
+    """Turns steps and progress into what is due, each event once.
 
-    def __init__(self, config: GaussianConfig) -> None:
-        self.config = config
+    Args:
+        config: Has the moments.
+        begin: Index of the step at which moments begin.
+    """
+
+    def __init__(self, config: GaussianConfig, begin: int = 0) -> None:
+        self.config, self.begin = config, begin
         self.last_moment = 0
         """Moment of the latest step; 0 before the first."""
 
-    def moment(self, progress: float) -> int:
-        """Iteration of the schedule, from 1."""
+    def moment(self, index: int, progress: float) -> int:
+        """Iteration of the schedule, from 1; arguments as in `chronoscene.methods.Method.step`."""
         config = self.config
-        length = config.schedule_length if config.stretch else config.iterations
-        return round(progress * length) + 1
+        done = round(progress * config.schedule_length) if config.stretch else index - self.begin
+        return done + 1
 
     def at(self, index: int, progress: float) -> Due:
         """Return what is due at a step; arguments as in `chronoscene.methods.Method.step`."""
-        config, moment = self.config, self.moment(progress)
+        config, moment = self.config, self.moment(index, progress)
         resets, resets_before = (m // config.reset_interval for m in (moment, self.last_moment))
         self.last_moment = moment
         growing = moment < config.densify_until
@@ -82,6 +89,7 @@ class Timeline:
         decay = moment / config.schedule_length  # beyond 1 after the end of the schedule
         return Due(
             moment=moment,
+            progress=progress,
             sh_degree=min(config.sh_degree, moment // config.sh_interval),
             position_lr=log_linear(decay, config.position_lr_initial, config.position_lr_final),
             collect=growing and adaptive,
@@ -106,7 +114,7 @@ class GaussianTrainer:
     background: Tensor
     """[3]"""
     learning_rates: Callable[[Due], Mapping[str, float]]
-    """Gives the learning rate of each tensor of the model at a step."""
+    """Gives the learning rate of each tensor of the model at a step, before any cooldown."""
 
     timeline_class: ClassVar[type[Timeline]] = Timeline
     scatter = staticmethod(scatter_in_space)
@@ -224,7 +232,7 @@ class GaussianTrainer:
         """The random part of a step of the kind mcmc."""
         if self.config.densification != "mcmc":
             return
-        parameters, rate = self.model.parameters, self.learning_rates(due)["means"]
+        parameters, rate = self.model.parameters, self._rates(due)["means"]
         generator = make_generator(self.background.device, self.seed, _NOISE_STREAM, index)
         parameters["means"].add_(noise(parameters, rate, self.config, generator))
 
@@ -258,4 +266,7 @@ class GaussianTrainer:
             logits.copy_(reset_opacities(logits, self.config.reset_opacity))
             self.optimizer.reset_moments("logit_opacities")
             skip = ("logit_opacities",)
-        self.optimizer.step(self.learning_rates(due), skip=skip)
+        self.optimizer.step(self._rates(due), skip=skip)
+
+    def _rates(self, due: Due) -> dict[str, float]:
+        return cooled(self.learning_rates(due), due.progress, self.config.cooldown)

@@ -17,6 +17,7 @@ from __future__ import annotations
 from chronoscene.methods.interface import (
     Method,
     MethodSize,
+    PeriodSharing,
     Prediction,
     StepReport,
     TrainingSet,
@@ -31,10 +32,12 @@ from chronoscene.methods.options import (
     config_from_values,
     options_of,
 )
+from chronoscene.methods.preset_files import is_preset_file, preset_name
 from chronoscene.methods.spec import (
     PROGRAM_GROUP,
     MethodSpec,
     ProgramConfig,
+    Range,
     Runner,
     import_object,
     installed_methods,
@@ -48,8 +51,10 @@ __all__ = [
     "MethodConfig",
     "MethodSize",
     "MethodSpec",
+    "PeriodSharing",
     "Prediction",
     "ProgramConfig",
+    "Range",
     "Runner",
     "StepReport",
     "TrainingSet",
@@ -61,7 +66,9 @@ __all__ = [
     "config_from_values",
     "import_object",
     "installed_methods",
+    "is_preset_file",
     "load_spec",
     "method_names",
     "options_of",
+    "preset_name",
 ]

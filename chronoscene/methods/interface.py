@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, computed_field
 
 from chronoscene.methods.options import MethodConfig
 from chronoscene.scene.gaussian_cloud import GaussianCloud
@@ -119,6 +120,43 @@ class MethodSize:
     """Name of the primitives: ``Gaussians``, ``anchors``."""
 
 
+@dataclass(frozen=True, slots=True)
+class PeriodSharing:
+    """Account of what the periods of a model share.
+
+    A block is what a primitive stores for one period, or for several that share it.
+    """
+
+    __pydantic_config__: ClassVar = ConfigDict(extra="ignore")  # what is computed is stored, too
+
+    blocks: tuple[int, ...]
+    """Primitives with 1, 2, ... T blocks. [T]"""
+    period_numbers: tuple[int, ...]
+    """Numbers stored for each period alone. [T]"""
+    partly_shared_numbers: int
+    """Numbers that some periods share, but not all."""
+    shared_numbers: int
+    """All others, down to the table that says who shares."""
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def invariant_share(self) -> float:
+        """Share of the primitives that have one block for all periods."""
+        return self.blocks[0] / max(sum(self.blocks), 1)
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def mean_blocks(self) -> float:
+        """Mean number of blocks of a primitive."""
+        total = sum(number * count for number, count in enumerate(self.blocks, start=1))
+        return total / max(sum(self.blocks), 1)
+
+    @property
+    def mean_period_numbers(self) -> float:
+        """Mean of `period_numbers`."""
+        return sum(self.period_numbers) / len(self.period_numbers)
+
+
 class Method(Protocol):
     """Interface of a method. ``method(config)`` makes one, `setup` or `load` fills it."""
 
@@ -147,6 +185,13 @@ class Method(Protocol):
         """Read what `save` wrote; `render` then gives the same pixels."""
 
     def size(self) -> MethodSize: ...
+
+    def sharing(self) -> PeriodSharing | None:
+        """Count what periods share; None if the options leave nothing that they could share.
+
+        Only where primitives have something of their own for each period; a method without it has
+        no such function.
+        """
 
     def render_split(
         self, view: View, *, geometry_period: float, appearance_period: float

@@ -23,6 +23,7 @@ from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
 from chronoscene.checks import check_choice, nearest
 from chronoscene.errors import ConfigError
+from chronoscene.methods.preset_files import find_preset
 from chronoscene.methods.spec import MethodSpec, import_object
 
 
@@ -47,15 +48,22 @@ def build_config(
 
     Text is read as the annotation of the option asks for, so ``--set`` can pass it as typed.
 
+    Args:
+        spec: The method.
+        preset: Name of one of its presets, or the path of a preset file.
+        overrides: Values that replace those of the preset.
+
     Raises:
         ConfigError: If the preset or a key is unknown, or a value is not what the option takes.
     """
     config_class = import_object(spec.config)
-    check_choice(f"{spec.name} --preset", preset, spec.presets)
-    adapters, values = _adapters(config_class), dict(spec.presets[preset])
-    for key, value in (overrides or {}).items():
-        check_choice(f"{spec.name} --set", key, adapters)
-        values[key] = _parsed(f"{spec.name} --set {key}", value, adapters[key])
+    start = find_preset(preset, spec)
+    check_choice(f"{spec.name} --preset", start.base, spec.presets)
+    adapters, values = _adapters(config_class), dict(spec.presets[start.base])
+    for place, given in ((preset, start.options), (f"{spec.name} --set", overrides or {})):
+        for key, value in given.items():
+            check_choice(place, key, adapters)
+            values[key] = _parsed(f"{place} {key}", value, adapters[key])
     config: MethodConfig = config_class(**values)
     return config
 

@@ -67,6 +67,19 @@ class ProgramConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class Range:
+    """Numbers that a search tries for an option.
+
+    An option that is a pair of numbers is multiplied by the number that is tried.
+    """
+
+    low: float
+    high: float
+    kind: Literal["log", "linear", "int"] = "log"
+    """``log``: small numbers as often as large ones; ``int``: whole numbers."""
+
+
+@dataclass(frozen=True, slots=True)
 class MethodSpec:
     """Description of a method, known without importing it."""
 
@@ -90,13 +103,24 @@ class MethodSpec:
     is a `ProgramConfig`."""
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Preset name to the values that differ from the defaults of the config class."""
+    titles: Mapping[str, str] = field(default_factory=dict)
+    """Names in tables of presets of which `title` would say too much or too little."""
+    per_period: tuple[str, ...] = ()
+    """Presets whose iterations are those of each period: each stage of ``sequential`` and each
+    model of ``separate`` has all of them, and a model of several periods as often as many."""
     resumable: bool = False
     """True if it has `Method.save_training` and `Method.load_training`."""
     main_options: tuple[str, ...] = ()
     """Options that people change first, in the order of ``chronoscene methods NAME``, which shows
     these alone unless asked for all. Empty: all options."""
+    search: Mapping[str, tuple[str | bool | int | float, ...] | Range] = field(default_factory=dict)
+    """Options that ``chronoscene tune`` searches over: the values to choose from, or a range."""
     runner: Runner | None = None
     """Commands, if it is another program."""
+
+    def title_of(self, preset: str) -> str:
+        """Return the name in tables of the method with a preset."""
+        return self.titles.get(preset, self.title)
 
 
 def import_object(reference: str) -> Any:

@@ -127,6 +127,52 @@ def make_split(scene: Scene, settings: SplitSettings, times: Times | None = None
     )
 
 
+def hold_out_validation(scene: Scene) -> Scene:
+    """Hold blocks of the training views back, as test views of a scene without the true ones.
+
+    Test views are left out with all that depends on them: masks, observations, and points that no
+    training view sees. Options that are chosen by scores on such a scene know nothing of them.
+
+    Args:
+        scene: Its images are not opened.
+
+    Returns:
+        The scene of the training views. Whole blocks of them, as ``blocked`` chooses by default,
+        are ``test``; where there are fewer views than blocks, single views are.
+
+    Raises:
+        SceneError: If a period has no training image, or none can be held back.
+    """
+    training = np.array([frame.split == "train" for frame in scene.frames], bool)
+    frames = scene.select(split="train")
+    lacking = [p.label for p in scene.periods if all(f.period != p.id for f in frames)]
+    if lacking or len(frames) < 2:
+        raise SceneError(
+            f"{scene.root}: validation",
+            expected="training images in each period, and at least two",
+            found=f"none in period {lacking[0]}" if lacking else f"{len(frames)}",
+            todo="move some from test to train, or use another scene",
+        )
+    points, rank = scene.points, np.cumsum(training, dtype=np.int32) - 1
+    points = points.select_observations(training[points.track_frame], rank)
+    whole = replace(
+        scene,
+        frames=frames,
+        points=points.select(np.diff(points.track_start) > 0),
+        masks={f.name: scene.masks[f.name] for f in frames if f.name in scene.masks},
+    )
+    blocks = min(len(frames), round(2 / FRACTION))
+    split = make_split(whole, SplitSettings("blocked", seed=0, blocks=blocks)).scene
+    if not split.select(split="test"):
+        raise SceneError(
+            f"{scene.root}: validation",
+            expected="a period with two training images or more",
+            found=f"{len(frames)} training images in {scene.num_periods} periods",
+            todo="move some from test to train, or use another scene",
+        )
+    return replace(split, split_rule="blocked split of the training images")
+
+
 def _check(settings: SplitSettings) -> None:
     for option, given, strategies in (
         ("--offset", settings.offset != 0, ("stratified",)),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Annotated, Self
 
-from pydantic import NonNegativeFloat
+from pydantic import Field, NonNegativeFloat
 
 from chronoscene.checks import check_choice
 from chronoscene.methods import check_options
@@ -37,6 +37,9 @@ class SplattingConfig:
     random_background: bool = False
     """Train with another colour behind everything in each step, so that no Gaussian is missing
     where a photo shows that colour. Images are rendered with the usual background."""
+    cooldown: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the training, its last, in which all learning rates of the model fall further, to a
+    tenth of what they would be: the model settles. Not in the papers."""
     exposure: ExposureKind = "none"
     """``image`` | ``period``: learn an affine transform of the colours for each training image, or
     for each period. A rendered view has that of its period: `chronoscene.training.exposure`."""

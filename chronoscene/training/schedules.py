@@ -39,11 +39,22 @@ def learning_rates(
     Args:
         rates: Value at the start and at the end of each rate, which falls log-linearly.
         progress: Share of the training that is over.
-        cooldown: Share of the training, its last, in which all rates fall further, to a tenth of
-            what they would be.
+        cooldown: As for `cooled`.
     """
     found = {name: log_linear(progress, *rate) for name, rate in rates.items()}
+    return cooled(found, progress, cooldown)
+
+
+def cooled(rates: Mapping[str, float], progress: float, cooldown: float) -> dict[str, float]:
+    """Lower the learning rates of a step, by name, in the last part of a training.
+
+    Args:
+        rates: What they would be.
+        progress: Share of the training that is over.
+        cooldown: Share of the training, its last, in which all rates fall further, log-linearly to
+            a tenth of what they would be. 0: they stay as they are.
+    """
     if not cooldown:
-        return found
+        return dict(rates)
     factor = log_linear(1.0 - (1.0 - progress) / cooldown, 1.0, _COOLED)
-    return {name: rate * factor for name, rate in found.items()}
+    return {name: rate * factor for name, rate in rates.items()}

@@ -13,6 +13,7 @@ from torch import Tensor
 from chronoscene.anchors.blocks import (
     BlockStatistics,
     agglomerate,
+    count_sharing,
     leaders,
     merge_alike,
     pack_blocks,
@@ -45,6 +46,19 @@ def test_what_is_stored_comes_back(anchors: int, periods: int, seed: int) -> Non
     assert set(restored) == set(tensors)
     assert torch.equal(restored["blocks"][restored["block_rows"]], values[rows])
     assert torch.equal(leaders(restored["block_rows"]), leaders(rows))
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 6), st.integers(1, 7), st.integers(0, 1000))
+def test_what_periods_share_is_counted(anchors: int, periods: int, seed: int) -> None:
+    _, rows = shared_rows(anchors, periods, seed)
+    by_blocks, alone = [0] * periods, [0] * periods
+    for row in rows.tolist():
+        by_blocks[len(set(row)) - 1] += 1
+        for period, block in enumerate(row):
+            alone[period] += row.count(block) == 1
+    found = count_sharing(rows)
+    assert [counts.tolist() for counts in found] == [by_blocks, alone]
 
 
 @pytest.mark.parametrize("periods", [256, 257, 1000])

@@ -402,6 +402,33 @@ def test_one_training_takes_the_periods_in_order() -> None:
         assert method.model.period == trainer_of(method).stage
 
 
+def test_moments_are_steps_of_the_period_where_schedules_are_not_stretched(tmp_path: Path) -> None:
+    """A training that goes on from a checkpoint within the second period has them, too."""
+    views = tuple(view for period in (0, 1) for view in stage(period).views)
+    images = [stage(0).load_image(i) for i in range(10)] * 2
+    joint = replace(
+        stage(1), views=views, point_periods=np.ones((60, 2), bool), load_image=images.__getitem__
+    )
+    moments: list[int] = []
+
+    def made() -> CLSplats:
+        method = CLSplats(config(stretch=False))
+        method.setup(joint, seed=0, device="cpu")
+        return method
+
+    def steps(method: CLSplats, indices: range) -> None:
+        for index in indices:
+            method.step(index, index / 20)
+            moments.append(trainer_of(method).timeline.last_moment)
+
+    first, second = made(), made()
+    steps(first, range(14))
+    first.save_training(tmp_path)
+    second.load_training(tmp_path)
+    steps(second, range(14, 20))
+    assert moments == [*range(1, 11), *range(1, 11)]
+
+
 def test_random_moves_are_refused() -> None:
     with pytest.raises(ConfigError, match="densification"):
         config(densification="mcmc")

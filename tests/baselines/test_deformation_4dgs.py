@@ -110,13 +110,13 @@ def test_the_schedule_of_the_released_configuration() -> None:
 
 def test_the_released_configuration_trains_in_both_stages() -> None:
     scene = moving_scene(arc)
-    method = Deformation4DGS(Deformation4DGSConfig())
+    method = Deformation4DGS(Deformation4DGSConfig(coarse_until=1))
     method.setup(scene, seed=0, device="cpu")
     # 62 numbers of each Gaussian are stored there, three of them normals.
     assert sum(t[0].numel() for t in method.model.parameters.values()) == 62 - 3
     planes = [t.numel() for n, t in method.model.shared.items() if n.startswith("planes.")]
     assert sum(planes) == sum(3 * 16 * (s * s + 150 * s) for s in (64, 128))
-    reports = [method.step(index, 0.4 * index) for index in range(3)]
+    reports = [method.step(index, index / 3) for index in range(3)]
     assert all(np.isfinite(report.loss) for report in reports)
     assert not np.array_equal(*(method.render(scene.views[0], p).rgb for p in (0, PERIODS - 1)))
 
@@ -263,11 +263,26 @@ def test_what_a_gpu_runs_trains_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-4)
 
 
+def test_the_scaled_twin_of_the_released_configuration_has_its_values() -> None:
+    """The unit is another, and nothing else, until lengths are converted to the training frame."""
+    paper, scaled, defaults = (
+        build_config(SPEC, preset=name) for name in ("paper", "paper-scaled", "paper-defaults")
+    )
+    assert replace(scaled, length_unit="world") == paper
+    assert scaled.in_training_frame(1 / 120) == scaled
+    assert paper.in_training_frame(1 / 120).plane_lr_initial == pytest.approx(0.192)
+    heads = (defaults.deform_opacity, defaults.deform_color, defaults.zero_start)
+    assert heads == (False, False, False) and defaults.length_unit == "training"
+    assert (defaults.iterations, defaults.time_cells, defaults.ssim_weight) == (33_000, 25, 0.0)
+
+
 @pytest.mark.parametrize("preset", SPEC.presets)
-def test_caps_of_the_released_code_are_in_the_preset_paper_alone(preset: str) -> None:
+def test_caps_of_the_released_code_are_in_the_presets_named_paper_alone(preset: str) -> None:
     made = build_config(SPEC, preset=preset)
     caps = (made.grow_below, made.prune_above, made.white_background, made.half_time_axis)
-    assert caps == ((360_000, 200_000, True, True) if preset == "paper" else (0, 0, False, False))
+    assert caps == (
+        (360_000, 200_000, True, True) if preset.startswith("paper") else (0, 0, False, False)
+    )
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
+from chronoscene.harness.train.checks import check_sharing
 from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.scene.similarity import Sim3
 
@@ -192,7 +193,11 @@ def owners(made: ChronoGS) -> float:
 
 
 def test_where_nothing_changes_no_anchor_keeps_a_block_of_its_own() -> None:
-    assert owners(train((1, 1, 1), steps=300, **LEAN)) < 0.01
+    made = train((1, 1, 1), steps=300, **LEAN)
+    assert owners(made) < 0.01
+    sharing = made.sharing()
+    assert sharing is not None and sharing.invariant_share == pytest.approx(1 - owners(made))
+    check_sharing(sharing, made.size(), "sharing")
 
 
 def test_a_period_with_one_image_shows_what_the_others_saw() -> None:
@@ -211,6 +216,7 @@ def test_one_period_has_one_block_for_each_anchor_and_no_global_feature() -> Non
     assert made.model.global_features.shape == (1, 0)
     assert made.model.block_rows.shape == (len(made.model), 1)
     assert len(made.model.blocks) == len(made.model)
+    assert made.sharing() is None
     assert psnr(made, 0, 0) > 20.0
 
 

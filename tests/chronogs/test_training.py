@@ -17,6 +17,7 @@ from chronogs.method import ChronoGS
 from chronoscene.anchors.decode import unpack_bits
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.harness.train.checks import check_sharing
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet
 from chronoscene.scene.similarity import Sim3
@@ -55,6 +56,17 @@ def test_learning_rates_at_start_middle_and_end(method: Make) -> None:
     assert at["global_features"] == pytest.approx([0.05, 0.005, 0.0005])
     trained = set(made.model.tensors()) - {"anchors", "block_rows"}
     assert set(rates) == trained
+
+
+@pytest.mark.parametrize("exposure", ["none", "period"])
+def test_periods_share_no_block_before_any_became_one(method: Make, exposure: str) -> None:
+    made = method(period_dim=5, global_dim=7, exposure=exposure)
+    sharing, count = made.sharing(), len(made.model)
+    assert sharing is not None and sharing.blocks == (0, 0, count)
+    own = 5 * count + 7 + (12 if exposure == "period" else 0)
+    assert sharing.period_numbers == (own,) * 3 and sharing.partly_shared_numbers == 0
+    check_sharing(sharing, made.size(), "sharing")
+    assert method(period_dim=0).sharing() is None
 
 
 @pytest.mark.parametrize("cooldown", [0.0, 0.25])

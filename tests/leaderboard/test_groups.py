@@ -18,8 +18,8 @@ def test_methods_with_the_same_preset_are_compared():
         {"scene_hash": "other"},
         {"split_hash": "other"},
         {"max_width": 800},
-        {"preset": "paper"},
-        {"variant": "iterations=7"},
+        {"iterations": 7},
+        {"iterations": None},
         {"variant": "budget=90s"},
     ],
 )
@@ -32,6 +32,20 @@ def test_equal_budgets_are_compared_on_one_device_whatever_the_preset():
     assert len(comparable(runs)) == 1
     assert effort_of(runs[0]) == "90s of training on cpu (Test, 2 threads)"
     assert len(comparable([runs[0], runs[0].model_copy(update={"device": "cuda"})])) == 2
+
+
+def test_presets_of_one_length_are_compared_and_others_are_not():
+    full = record(preset="full", iterations=3_000)
+    assert len(comparable([full, record(preset="balanced", iterations=3_000)])) == 1
+    assert effort_of(full) == "3,000 training steps"
+    paper = [record("4dgs", preset="paper", iterations=n) for n in (18_000, 40_000)]
+    assert len(comparable(paper)) == 2
+
+
+def test_a_budget_for_each_model_is_another_effort():
+    total, each = "budget=90s", "budget=90s,separate_iterations=each"
+    runs = [record(strategy="separate", variant=variant) for variant in (total, each)]
+    assert len(comparable(runs)) == 2
 
 
 def test_an_option_of_a_method_is_no_effort():

@@ -141,6 +141,23 @@ def test_scenes_of_one_name_have_rows_of_their_own(make_run, tmp_path):
         assert "23.00" in text and "12.50" in text
 
 
+def test_pages_say_what_is_of_older_code_and_the_role_of_a_scene(make_run, tmp_path):
+    (path,) = submit([make_run(seed=0)], tmp_path / "e")
+    path.write_text(path.read_text().replace('"outdated": false', '"outdated": true'))
+    submit([make_run(seed=1)], tmp_path / "e")  # which keeps the mark
+    submit([make_run("lab-method")], tmp_path / "e")
+    entries = read_entries(tmp_path / "e")
+    write_site(entries.values(), load_published(), tmp_path / "site", [tmp_path / "runs"])
+    for page in ("index.html", "scene/plaza.html", "method/3dgs.html"):
+        text = (tmp_path / "site" / page).read_text(encoding="utf-8")
+        assert "3DGS of older code (" in text, page
+        assert "LAB-METHOD of older code" not in text
+    text = (tmp_path / "site/scene/plaza.html").read_text(encoding="utf-8")
+    assert "This is a scene without a role" in text
+    assert '<option value="0">3DGS of older code' in text
+    assert "<h1>3DGS</h1>" in (tmp_path / "site/method/3dgs.html").read_text(encoding="utf-8")
+
+
 def test_commands_make_the_run_again(make_run, tmp_path):
     submit([make_run(variant="sh_degree=2,budget=90s", max_width=800)], tmp_path / "e")
     write_site(read_entries(tmp_path / "e").values(), load_published(), tmp_path / "site")

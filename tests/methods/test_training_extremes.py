@@ -7,7 +7,7 @@ import pytest
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import load_spec, method_names
 
-CHEAP = [e for e in extreme_trainings.EXTREMES[1:] if e.steps > 1]
+CHEAP = [e for e in extreme_trainings.EXTREMES[1:] if e.cheap]
 
 
 @pytest.fixture(autouse=True)
@@ -20,12 +20,13 @@ def one_thread():
 @pytest.mark.parametrize("name", method_names())
 @pytest.mark.parametrize("extreme", CHEAP, ids=lambda e: e.name)
 def test_a_training_ends_in_a_model_or_in_one_clear_error(extreme, name):
-    outcome = extreme_trainings.run(extreme, load_spec(name))
+    outcome = extreme_trainings.run(extreme, load_spec(name), "fast")
     assert outcome.clear, outcome.error
-    if extreme.rates > 1:
-        # A step that is too long may leave a model that no view shows: that is the error.
-        assert outcome.error is None or "lower the learning rates" in outcome.error
+    if outcome.error is not None:
+        assert extreme.advice is not None and extreme.advice in outcome.error
         return
-    assert outcome.error is None
+    assert outcome.reports[-1].primitives > 0
+    if extreme.rates > 1 or extreme.points == 3:
+        return  # a model, but it may be worse than the initial one
     assert np.isfinite([report.loss for report in outcome.reports]).all()
     assert outcome.after > outcome.before - 0.05

@@ -9,9 +9,13 @@ from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.train import painted_balls
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object, load_spec
+from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.views import downscale_view
 
 STEPS = 30
+
+GAUSSIANS = ["4dgs", "realtime4dgs", "gs-w", "cl-splats"]
+"""Methods that are 3DGS and something else."""
 
 OPTIONS = [
     ("3dgs", {"random_background": True}),
@@ -24,7 +28,7 @@ OPTIONS = [
     ("chronogs", {"exposure": "period"}),
     ("chronogs", {"unused_share": 0.05, "cooldown": 0.2}),
     ("chronogs", {"merge_share": 0.5, "density_interval": 8}),
-    ("4dgs", {"exposure": "period"}),
+    ("4dgs", {"exposure": "period", "cooldown": 0.5}),
     ("gs-w", {"reference": "period", "exposure": "image"}),
     ("3dgs", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
     ("gs-w", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
@@ -105,7 +109,33 @@ def test_a_random_background_leaves_no_hole_where_photos_are_as_dark_as_it(name)
     assert drawn[1] > 1.2 * drawn[0]
 
 
-@pytest.mark.parametrize("name", ["3dgs", "4dgs", "scaffold-gs", "chronogs"])
+@pytest.mark.parametrize("name", ["3dgs", *GAUSSIANS])
+def test_a_cooldown_lowers_the_rates_of_all_tensors_in_its_share(name, monkeypatch):
+    """Networks and planes are among them. Anchors: tests/chronogs/test_training.py."""
+    data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))
+    taken, step = [], Adam.step
+
+    def watched(adam, rates, **options):
+        taken[-1].append(dict(rates))
+        step(adam, rates, **options)
+
+    monkeypatch.setattr(Adam, "step", watched)
+    steps = range(0, STEPS, 3)
+    for cooldown in (0.0, 0.25):
+        taken.append([])
+        options = {"cooldown": cooldown, "exposure": "none"}
+        method = start(name, replace(data, views=data.views[:1]), **options)
+        for index in steps:
+            method.step(index, index / STEPS)
+    for index, plain, cooled in zip(steps, *taken, strict=True):
+        assert cooled.keys() == plain.keys() >= set(method.model.tensors()) - {"strays"}
+        factor = 0.1 ** max((index / STEPS - 0.75) / 0.25, 0.0)
+        for tensor, rate in plain.items():
+            assert cooled[tensor] == pytest.approx(rate * factor, rel=1e-12), tensor
+            assert index < 0.75 * STEPS or cooled[tensor] < rate
+
+
+@pytest.mark.parametrize("name", ["3dgs", *GAUSSIANS, "scaffold-gs", "chronogs"])
 def test_antialiased_models_are_as_opaque_in_small_images(name):
     """At a quarter of the size the blur enlarges everything, unless opacities make up for it."""
     data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))

@@ -1,5 +1,6 @@
 """Strategies for new splits."""
 
+from dataclasses import replace
 from datetime import datetime
 
 import numpy as np
@@ -17,6 +18,7 @@ from chronoscene.scene.split_making import (
     SplitSettings,
     choose_blocks,
     cut_into_blocks,
+    hold_out_validation,
     latest,
     make_split,
 )
@@ -263,3 +265,72 @@ def test_periods_of_one_image_can_only_be_held_out_whole(make_scene_folder):
 def test_no_image_is_held_out_if_asked_for():
     new = make_split(make_scene([0, 0, 1]), SplitSettings("none"))
     assert {frame.split for frame in new.scene.frames} == {"train"} and new.nearest is None
+
+
+def observed(scene):
+    """Points by name, with the names of the frames that see them and where."""
+    points, found = scene.points, {}
+    for i, name in enumerate(points.ids.tolist()):
+        rows = range(*points.track_start[i : i + 2])
+        found[name] = [
+            (scene.frames[points.track_frame[r]].name, *points.track_xy[r]) for r in rows
+        ]
+    return found
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 2), st.booleans()), max_size=40),
+    st.lists(st.lists(st.integers(0, 48), unique=True, max_size=6), max_size=12),
+)
+def test_validation_knows_the_training_views_alone(drawn, tracks):
+    """Whole blocks of them are scored, and nothing of the test views is left."""
+    drawn = [*((p, False) for p in (0, 1, 2) * 2), *drawn]
+    rng = np.random.default_rng(len(drawn))
+    scene = make_scene([p for p, _ in drawn], rng.normal(size=(len(drawn), 3)))
+    frames = [
+        replace(f, split="test" if test else "train")
+        for f, (_, test) in zip(scene.frames, drawn, strict=True)
+    ]
+    tracks = [sorted(i % len(frames) for i in track) for track in tracks]
+    lengths = [len(track) for track in tracks]
+    points = Points(
+        ids=np.arange(len(tracks)),
+        xyz=rng.normal(size=(len(tracks), 3)),
+        rgb=np.zeros((len(tracks), 3), np.uint8),
+        error=np.zeros(len(tracks)),
+        track_start=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        track_frame=np.array([i for track in tracks for i in track], np.int32),
+        track_xy=rng.normal(size=(sum(lengths), 2)),
+    )
+    masks = {f.name: scene.images_root for f in frames[::2]}
+    scene = replace(scene.with_frames(frames), points=points, masks=masks)
+    found = hold_out_validation(scene)
+
+    names = {f.name for f in scene.select(split="train")}
+    assert [f.name for f in found.frames] == sorted(names)
+    assert found.masks.keys() == masks.keys() & names
+    before = {name: [o for o in seen if o[0] in names] for name, seen in observed(scene).items()}
+    assert observed(found) == {name: seen for name, seen in before.items() if seen}
+    assert found.select(split="test")
+    assert all(found.select(split="train", period=p) for p in range(3))
+    kept = [f for f in frames if f.split == "train"]
+    centres = camera_centre(np.stack([f.cam_from_world for f in kept]))
+    block = cut_into_blocks(centres, min(len(kept), 16))
+    tests = {b for f, b in zip(found.frames, block.tolist(), strict=True) if f.split == "test"}
+    trains = {b for f, b in zip(found.frames, block.tolist(), strict=True) if f.split == "train"}
+    assert not tests & trains
+
+
+@pytest.mark.parametrize(
+    ("splits", "found"),
+    [
+        ("test train train", "found none in period 0"),
+        ("train test test", "found none in period 1"),
+        ("train train test", "found 2 training images in 2 periods"),
+    ],
+)
+def test_validation_needs_training_views_in_each_period(splits, found):
+    scene = make_scene([0, 1, 1])
+    frames = [replace(f, split=s) for f, s in zip(scene.frames, splits.split(), strict=True)]
+    with pytest.raises(SceneError, match=f"validation: expected .*{found}"):
+        hold_out_validation(scene.with_frames(frames))

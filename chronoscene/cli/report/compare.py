@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 
-from chronoscene.cli.options import EXISTING_FOLDER, FILE
+from chronoscene.cli.options import EXISTING_FOLDER, FILE, SCENE
 from chronoscene.cli.output import (
     A_FILE,
     check_file,
@@ -15,10 +17,16 @@ from chronoscene.cli.output import (
     terminal_width,
     writing_to,
 )
-from chronoscene.harness.report.comparison_figure import draw_figures
+from chronoscene.cli.progress import progress_bar
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.ground_truth import ground_truth_folder
+from chronoscene.harness.report.between_figure import between_csv, between_table, draw_between
+from chronoscene.harness.report.comparison_figure import by_scene, chosen_views, draw_figures
 from chronoscene.harness.report.comparison_page import comparison_page
 from chronoscene.harness.report.single_views import view_scores, worst_views
-from chronoscene.harness.report.summary import read_runs
+from chronoscene.harness.report.summary import kind_of, read_runs
+from chronoscene.harness.use.between import measure_between, parse_dates
+from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import boxed_text
 from chronoscene.metrics.registry import metric_info
@@ -47,17 +55,38 @@ from chronoscene.metrics.registry import metric_info
     help="Also write one page of all runs to this file: tables, quality against time, and sliders "
     "between the photos and what methods show. It needs no other file.",
 )
+@click.option(
+    "--periods",
+    metavar="FROM:TO",
+    help="Render what methods show between two neighbouring periods instead, and print how far "
+    "that is from the nearer one.",
+)
+@SCENE
 def command(
-    runs: Path, views: int, metric: str, style: str, out: Path | None, html: Path | None
+    runs: Path,
+    views: int,
+    metric: str,
+    style: str,
+    out: Path | None,
+    html: Path | None,
+    periods: str | None,
+    scene: Path | None,
 ) -> None:
     """Show where the methods of finished runs differ.
 
     Figures are written to RUNS/figures: photos and predictions side by side, with the window in
     which methods differ most enlarged, and error maps on one scale. The worst test views of all
     methods are printed.
+
+    With --periods, the models are rendered: one test camera from one period to the next, a row for
+    each method. docs/reference/scores.md defines the score.
     """
     check_file("--out", out)
     check_file("--html", html)
+    if periods is not None:
+        _refuse_options()
+        compare_between(runs, periods, style, out, scene)
+        return
     name = metric_info(metric).name
     records, failures = read_runs([runs])
     scores = view_scores(records, name)
@@ -74,3 +103,44 @@ def command(
         with writing_to("--html", html, expected=A_FILE):
             write_text_atomic(html, text)
         report_written(html)
+
+
+def _refuse_options() -> None:
+    """Refuse options that have no effect with --periods."""
+    context = click.get_current_context()
+    for name in ("views", "metric", "html"):
+        if context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
+            raise ConfigError(
+                f"--{name}", expected="none with --periods", found="one", todo="leave one out"
+            )
+
+
+def compare_between(
+    runs: Path, periods: str, style: str, out: Path | None, root: Path | None
+) -> None:
+    """Render and score the methods of all scenes between two periods; draw a figure of each."""
+    records, _ = read_runs([runs])
+    found = []
+    with progress_bar() as bar:
+        for name, chosen in by_scene(records).items():
+            opened = [open_run(record.folder) for record in chosen]
+            dates = parse_dates(opened[0], periods)
+            views = chosen_views(ground_truth_folder(runs, name), 1)
+            if not (own := [v.view for v in views if v.camera_period in dates]):
+                raise ConfigError(
+                    f"--periods {periods}",
+                    expected="a period with test views",
+                    found="none",
+                    todo="name others",
+                )
+            scene = opened[0].scene(root)
+            titles = [f"{record.title}\n{kind_of(record)}" for record in chosen]
+            progress = partial(bar, f"{name}: render")
+            found.append(measure_between(opened, titles, scene, dates, own[0], progress=progress))
+    if style == "csv":
+        emit(between_csv(found), out)
+    else:
+        width = terminal_width(out)
+        emit("\n".join(boxed_text(between_table(part), width=width) for part in found), out)
+    with writing_to("RUNS", runs):
+        report_written(*(draw_between(runs, part) for part in found))

@@ -53,5 +53,6 @@ def leaderboard_command(entries: Path, out: Path, runs: tuple[Path, ...]) -> Non
     check_place("--out", out)
     found = [*read_entries(entries).values()]
     pictured = write_site(found, load_published(), out, runs)
-    click.echo(f"{len(found)} measured entries, {pictured} of them with pictures")
+    outdated = sum(entry.outdated for entry in found)
+    click.echo(f"{len(found)} measured entries: {outdated} of older code, {pictured} with pictures")
     report_written(out / "index.html")

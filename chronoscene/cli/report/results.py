@@ -13,6 +13,7 @@ from chronoscene.cli.progress import progress_bar
 from chronoscene.harness.files.records import RESULTS_FILE, ROWS_FILE
 from chronoscene.harness.report.comparison_figure import draw_figures
 from chronoscene.harness.report.published import load_published
+from chronoscene.harness.report.sharing_figure import draw_sharing
 from chronoscene.harness.report.stage_figure import draw_stages
 from chronoscene.harness.report.summary import in_region, read_runs
 from chronoscene.harness.report.tables import MAX_PERIODS, format_runs
@@ -75,7 +76,8 @@ def print_runs(out: Path) -> None:
     records, failures = read_runs([out])
     text = format_runs(records, failures, "table", width=terminal_width(None))
     emit(text + "\n", None)
-    figures = [*draw_figures(out, records), *draw_stages(out, records)]
+    drawers = (draw_figures, draw_stages, draw_sharing)
+    figures = [path for draw in drawers for path in draw(out, records)]
     click.echo("\n".join(map(str, (out / RESULTS_FILE, out / ROWS_FILE, *figures))))
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import click
 
-from chronoscene.checks import check_choice
 from chronoscene.cli.options import (
     FOLDER,
     LPIPS_WEIGHTS,
@@ -33,7 +32,6 @@ from chronoscene.harness.plan.stop import parse_duration
 from chronoscene.harness.run.runner import BenchOutcome, run_bench
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
-from chronoscene.kernels.runtime import check_device
 
 SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 
@@ -80,9 +78,9 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 @click.option(
     "--separate-iterations",
     type=click.Choice(SHARING),
-    default=SHARING[0],
     help="Whether the models of strategy separate, or the stages of strategy sequential, share "
-    "iterations and budget or each get them.",
+    "iterations and budget or each get them.  [default: total; each for presets whose iterations "
+    "are per period]",
 )
 @click.option(
     "--max-width",
@@ -102,6 +100,12 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
     default=PHOTO_DISK / 1e9,
     help="Disk space below --out in GB for decoded photos, if they do not fit into memory.",
 )
+@click.option(
+    "--validation",
+    is_flag=True,
+    help="Hold blocks of the training views back and score these; test views are not read. "
+    "For choosing options.",
+)
 @LPIPS_WEIGHTS
 @RUNS_OUT
 @click.option(
@@ -118,9 +122,7 @@ def command(methods: str, strategies: str, seeds: int, seed: int, **options: Any
     look_here_for(names)
     settings = settings_from(
         methods=names,
-        strategies=tuple(
-            check_choice("--strategy", s, STRATEGIES) for s in split_list("--strategy", strategies)
-        ),
+        strategies=split_list("--strategy", strategies),
         seeds=tuple(range(seed, seed + seeds)),
         **options,
     )
@@ -147,7 +149,7 @@ def settings_from(
     """
     check_outside(out, scenes, option="--out")
     check_place("--out", out)
-    settings = bench_settings(
+    return bench_settings(
         scenes,
         methods,
         out,
@@ -158,9 +160,6 @@ def settings_from(
         photo_disk=round(photo_disk * 1e9),
         **options,
     )
-    if settings.ray is None:  # else the machine that runs a job checks its own
-        check_device(settings.run.device)
-    return settings
 
 
 def report(outcome: BenchOutcome, out: Path) -> None:

@@ -72,6 +72,13 @@ def command(
         draw_changes(cloud_of(found), panels, staged / "changes.png")
     table = changes_table(maps, run.record.period_labels, run.record.label)
     emit(boxed_text(table, width=terminal_width(None)), None)
+    if (sharing := run.record.sharing) is not None:
+        unit, count = run.record.primitive, sum(sharing.blocks)
+        click.echo(
+            f"the model has one block of features for all periods in "
+            f"{100 * sharing.invariant_share:.1f} % of its {count:,} {unit}, and "
+            f"{sharing.mean_blocks:.2f} of {len(sharing.blocks)} on average"
+        )
     report_written(out)
     if not any(scores for _, scores in maps):
         click.echo(f"not scored: no change masks of test views in {found.root / 'gt'}", err=True)

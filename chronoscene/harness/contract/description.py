@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 
-from chronoscene.harness.contract.subject import Subject, demand, python
+from chronoscene.harness.contract.subject import NotApplicableError, Subject, demand, python
 from chronoscene.harness.train.checks import refuse
 from chronoscene.methods import build_config
+from chronoscene.methods.search_space import ends, starting_point
 
 HEAVY = {"torch", "numba", "open3d", "cv2", "matplotlib", "pycolmap"}
 """Modules that listing the methods must not import."""
@@ -52,6 +53,9 @@ def spec_imports_nothing_heavy(subject: Subject) -> None:
 def presets_build_a_frozen_config(subject: Subject) -> None:
     """Presets balanced and fast exist, and each builds a frozen config with iterations."""
     spec = subject.spec
+    for field in ("titles", "per_period"):
+        named = set(getattr(spec, field))
+        demand(named <= spec.presets.keys(), f"MethodSpec.{field}", "names of presets", named)
     for preset in ("balanced", "fast"):
         demand(preset in spec.presets, "MethodSpec.presets", f"a preset {preset}", [*spec.presets])
     for preset in spec.presets:
@@ -70,4 +74,24 @@ def presets_build_a_frozen_config(subject: Subject) -> None:
         raise refuse(place, "a frozen dataclass", "one that can be changed")
 
 
-CHECKS = (spec_is_plain_data, spec_imports_nothing_heavy, presets_build_a_frozen_config)
+def search_space_holds_the_presets(subject: Subject) -> None:
+    """Each option of the search space exists, with the value of the presets; its ends are valid."""
+    spec = subject.spec
+    if not spec.search:
+        raise NotApplicableError("it has no search space")
+    for preset in spec.presets:
+        config = build_config(spec, preset=preset)
+        for name in spec.search:
+            demand(hasattr(config, name), "MethodSpec.search", "options of the config", name)
+        starting_point(spec, config)
+    for preset in ("balanced", "fast"):
+        for options in ends(spec, build_config(spec, preset=preset)):
+            build_config(spec, preset=preset, overrides=options)
+
+
+CHECKS = (
+    spec_is_plain_data,
+    spec_imports_nothing_heavy,
+    presets_build_a_frozen_config,
+    search_space_holds_the_presets,
+)

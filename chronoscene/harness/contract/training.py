@@ -34,9 +34,12 @@ def training_lowers_the_loss(subject: Subject) -> None:
 
 
 def the_unit_of_the_scene_does_not_matter(subject: Subject) -> None:
-    """Millimetres instead of metres change nothing; presets named paper may do as papers did."""
+    """Millimetres instead of metres change nothing.
+
+    Presets named paper may do as papers did, paper-scaled may not.
+    """
     for preset in subject.spec.presets:
-        if preset.startswith("paper"):
+        if preset.startswith("paper") and preset != "paper-scaled":
             continue
         images = []
         for scale in (0.25, 0.25e-3):

@@ -33,7 +33,8 @@ def freeze_ground_truth(
         _write_ground_truth(folder, scene, scene_hash, store, details)
     manifest = read_manifest(folder)
     if manifest.scene_hash != scene_hash:
-        raise _conflict(folder, "the same scene", "another scene of this name, or other photos")
+        found = "another scene of this name, another split of it, or other photos"
+        raise _conflict(folder, "the same scene", found)
     if manifest.details.get("max_width") != max_width:
         found = f"--max-width {manifest.details.get('max_width')}"
         raise _conflict(folder, f"--max-width {max_width}", found)

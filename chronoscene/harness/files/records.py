@@ -20,6 +20,7 @@ from chronoscene.errors import CheckpointError
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import csv_text
+from chronoscene.methods import PeriodSharing
 
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.json"
@@ -39,7 +40,7 @@ FIGURES = "figures"
 
 Values = dict[str, float]
 Document = TypeVar("Document", bound=BaseModel)
-Line = TypeVar("Line", "CurvePoint", "ViewScore")
+Line = TypeVar("Line", bound="CurvePoint | ViewScore")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +108,8 @@ class RunRecord(BaseModel):
     """Unit of `primitives`: ``Gaussians``, ``anchors``."""
     drawn: float | None = None
     """Gaussians that touch a test view, mean over the views; None if the method does not say."""
+    sharing: PeriodSharing | None = None
+    """Account of what the periods share in the model."""
     checkpoint_bytes: int | None
     peak_memory_bytes: int | None
     """Largest resident memory of the process from the start of training to the end of rendering;
@@ -230,6 +233,15 @@ def read_rows(folder: Path) -> list[ViewScore]:
     return read_lines(folder / ROWS_FILE, ViewScore, expected="the rows of a run")
 
 
+def read_with_rows(folder: Path) -> RunRecord:
+    """Read a finished run with the values of its views.
+
+    Raises:
+        CheckpointError: If a file is missing or damaged.
+    """
+    return read_run(folder).model_copy(update={"rows": read_rows(folder), "folder": folder})
+
+
 def read_lines(path: Path, kind: type[Line], *, expected: str) -> list[Line]:
     """Read a CSV file with the fields of a dataclass among its columns.
 
@@ -242,7 +254,7 @@ def read_lines(path: Path, kind: type[Line], *, expected: str) -> list[Line]:
         with path.open(encoding="utf-8", newline="") as file:
             lines = csv.DictReader(file)
             return [kind(*[convert(line[name]) for name, convert in columns]) for line in lines]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise CheckpointError(
             path,
             expected=expected,

@@ -6,7 +6,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
+from chronoscene.formats import read_scene
 from chronoscene.harness.files.records import SOURCE_FILE, read_document
+from chronoscene.scene import Scene
 
 
 class RunSource(BaseModel):
@@ -22,6 +24,8 @@ class RunSource(BaseModel):
     scene_format: str
     period_by: str | None = None
     """Argument of `read_scene`."""
+    validation: bool = False
+    """Argument of `read_bench_scene`."""
     training_from_world: list[list[float]]
     """Similarity transform as a matrix. [4, 4]"""
 
@@ -39,3 +43,23 @@ def read_source(folder: Path) -> RunSource:
         found="no such file: an earlier version made the run",
         todo="run bench again with --overwrite",
     )
+
+
+def read_bench_scene(
+    root: Path, *, format: str | None, period_by: str | None, validation: bool
+) -> Scene:
+    """Read a scene as runs have it: bench, its workers, and whoever opens a run later.
+
+    Args:
+        root: As ``format`` and ``period_by``, for `read_scene`.
+        validation: True for the training views alone, some of which are test views.
+
+    Raises:
+        SceneError: If the scene cannot be read, or has too few views for validation.
+    """
+    scene = read_scene(root, format=format, period_by=period_by)
+    if validation:
+        from chronoscene.scene.split_making import hold_out_validation  # scipy takes time to load
+
+        return hold_out_validation(scene)
+    return scene

@@ -12,7 +12,6 @@ from chronoscene.errors import ConfigError
 from chronoscene.formats import writable_formats
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.resolve import ResolvedRun
-from chronoscene.harness.plan.settings import SHARING
 from chronoscene.methods import ProgramConfig, Runner, import_object
 
 VALUES = ("data", "output", "work", "iterations", "seconds", "seed")
@@ -107,10 +106,7 @@ def check_run(run: ResolvedRun) -> None:
             found=spec.name,
             todo="run this method without",
         )
-    check_choice("--separate-iterations", settings.separate_iterations, SHARING)
     if STRATEGIES[job.strategy].in_order:
         check_stages(run)
     if spec.runner is not None:
         check_runner(run, spec.runner)
-    if settings.device != "auto":
-        check_choice(f"{spec.name} --device", settings.device, spec.devices)

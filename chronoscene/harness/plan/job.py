@@ -83,7 +83,7 @@ class Job:
 
     @property
     def _names(self) -> tuple[str, ...]:
-        return self.method_name, self.strategy, self.settings.preset
+        return self.method_name, self.strategy, self.settings.preset_name
 
     @property
     def training(self) -> Path:
@@ -101,7 +101,7 @@ class Job:
         return Failure(
             method=self.method_name,
             strategy=self.strategy,
-            preset=self.settings.preset,
+            preset=self.settings.preset_name,
             variant=self.variant,
             scene=self.scene,
             seed=self.seed,
@@ -116,6 +116,7 @@ class Job:
             scene_root=self.scene_root,
             scene_format=self.scene_format,
             period_by=self.settings.period_by,
+            validation=self.settings.validation,
             training_from_world=training_from_world.to_matrix().tolist(),
         )
         path = Path(self.staging) / SOURCE_FILE

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chronoscene.errors import ConfigError
-from chronoscene.formats import read_scene
 from chronoscene.harness.files.records import PHOTOS
+from chronoscene.harness.files.source import read_bench_scene
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.settings import RunSettings
 from chronoscene.images.disk_cache import DiskCache, files_of
@@ -110,8 +110,12 @@ def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
 
 def read_scene_of(job: Job) -> Scene:
     """Read the scene of a job."""
-    rule = job.settings.period_by
-    return read_scene(Path(job.scene_root), format=job.scene_format, period_by=rule)
+    return read_bench_scene(
+        Path(job.scene_root),
+        format=job.scene_format,
+        period_by=job.settings.period_by,
+        validation=job.settings.validation,
+    )
 
 
 def check_room(

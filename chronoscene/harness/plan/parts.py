@@ -19,6 +19,7 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3
 
 EXTENT_MARGIN = 1.1  # Factor of 3DGS between the farthest camera and the camera extent
+LEAST_SPREAD = 1e-6  # Of the points, over the distance of the farthest camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +86,8 @@ def make_parts(
         takes_period: Whether the method takes the period.
 
     Raises:
-        SceneError: If a camera is distorted, or images or points are missing that are needed.
+        SceneError: If a camera is distorted, images or points are missing that are needed, or all
+            points are in one place.
     """
     check_choice("--strategy", strategy, STRATEGIES)
     check_scene(scene)
@@ -199,10 +201,18 @@ def _training_set(
             found="none",
             todo="triangulate points with COLMAP",
         )
+    points = to_training.apply(scene.points.xyz[kept])
+    if np.ptp(points, axis=0).max() < LEAST_SPREAD:
+        raise SceneError(
+            scene.root,
+            expected="sparse points in different places",
+            found=f"{len(points)} in one place",
+            todo="triangulate points with COLMAP",
+        )
     return TrainingSet(
         views=tuple(_training_view(f, store, to_training, hide_period) for f in frames),
         num_periods=1 if hide_period else known.stop,
-        points=to_training.apply(scene.points.xyz[kept]).astype(np.float32),
+        points=points.astype(np.float32),
         colors=scene.points.rgb[kept],
         point_periods=np.ones((int(kept.sum()), 1), bool) if hide_period else seen[kept],
         training_from_world=to_training,

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from itertools import chain, product
 from pathlib import Path
 
+from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
-from chronoscene.formats import read_scene
 from chronoscene.harness.files.ground_truth import freeze_ground_truth
 from chronoscene.harness.files.provenance import scene_hash
+from chronoscene.harness.files.source import read_bench_scene
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.checks import check_run
 from chronoscene.harness.plan.finished import continued, is_to_do
@@ -18,9 +19,10 @@ from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.memory import check_room, photo_needs
 from chronoscene.harness.plan.parts import check_scene, effective_strategy
 from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun, resolve_method
-from chronoscene.harness.plan.settings import SHARING, BenchSettings
+from chronoscene.harness.plan.settings import BenchSettings
 from chronoscene.images.store import ImageStore
 from chronoscene.io.log import Log
+from chronoscene.kernels.runtime import check_device
 from chronoscene.methods import load_spec
 from chronoscene.metrics.lpips_weights import check_available
 from chronoscene.scene import Scene
@@ -51,6 +53,11 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     if shared.lpips_weights is not None:
         check_available(shared.lpips_weights)
     methods = [resolve_method(reference, spec, shared) for reference, spec in specs]
+    for _, spec in specs:
+        if shared.device != "auto":
+            check_choice(f"{spec.name} --device", shared.device, spec.devices)
+    if settings.ray is None:  # else the machine that runs a job checks its own
+        check_device(shared.device)
     plan = Plan({}, {})
     notices: dict[str, None] = {}
     for scene in _read_scenes(settings, log):
@@ -78,8 +85,12 @@ def _read_scenes(settings: BenchSettings, log: Log) -> Iterable[Scene]:
     scenes: dict[str, Scene] = {}
     for path in settings.scenes:
         log(f"read {path}")
-        rule = settings.run.period_by
-        scene = read_scene(path, format=settings.dataset_format, period_by=rule)
+        scene = read_bench_scene(
+            path,
+            format=settings.dataset_format,
+            period_by=settings.run.period_by,
+            validation=settings.run.validation,
+        )
         if other := scenes.get(scene.name):
             raise ConfigError(
                 scene.root,
@@ -102,12 +113,7 @@ def _runs_of_scene(
         own = method.settings
         if own.budget_seconds is not None:
             notices.append(BUDGET_NOTICE)
-        several = STRATEGIES[strategy].model_per_period or STRATEGIES[strategy].in_order
-        own = replace(
-            own,
-            separate_iterations=own.separate_iterations if several else SHARING[0],
-            keep_training=own.keep_training or settings.continue_to is not None,
-        )
+        own = replace(own, keep_training=own.keep_training or settings.continue_to is not None)
         job = Job(
             scene_root=str(scene.root.resolve()),
             scene_format=scene.format,
@@ -134,9 +140,11 @@ def _strategy(method: ResolvedMethod, wanted: str) -> tuple[str, list[str]]:
     """The strategy that a method can follow, and notices for the user."""
     strategy, notice = effective_strategy(method.spec, wanted)
     notices, kind = [notice] if notice else [], STRATEGIES[strategy]
+    each = method.sharing(strategy) == "each"
+    if strategy == "joint" and each:
+        notices.append("joint: the model has all iterations and time once for each period")
     if kind.model_per_period or kind.in_order:
         unit = "stage" if kind.in_order else "model"
-        each = method.settings.separate_iterations == "each"
         has = f"each {unit} has all" if each else f"the {unit}s of a run share the"
         notices.append(f"{strategy}: {has} iterations and time")
     return strategy, notices

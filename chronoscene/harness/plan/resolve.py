@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.provenance import config_hash
+from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.job import Job
+from chronoscene.harness.plan.parts import Part
 from chronoscene.harness.plan.settings import SHARING, RunSettings
 from chronoscene.harness.plan.stop import StopRule
 from chronoscene.methods import (
@@ -35,12 +38,25 @@ class ResolvedMethod:
     preset: dict[str, Any]
     """Options of the preset that decide the result."""
 
+    def sharing(self, strategy: str) -> str:
+        """Return how the models or stages of a strategy share iterations, one of `SHARING`."""
+        kind, own = STRATEGIES[strategy], self._own_sharing
+        if own == "total" and not (kind.model_per_period or kind.in_order):
+            return own
+        return self.settings.separate_iterations or own
+
+    @property
+    def _own_sharing(self) -> str:
+        """Return that of the preset."""
+        return SHARING[self.settings.preset in self.spec.per_period]
+
     def run(self, job: Job) -> ResolvedRun:
         """Resolve a run of this method; its job gets its variant.
 
         The variant lists the options that differ from the preset, and what else ends the run;
         ``iterations=20+50`` is a training of 20 iterations that went on to 50.
         """
+        job = job.with_settings(separate_iterations=self.sharing(job.strategy))
         config, settings = self.config, job.settings
         if settings.iterations not in (None, config.iterations):
             config = replace(config, iterations=settings.iterations)
@@ -53,8 +69,10 @@ class ResolvedMethod:
             if settings.iterations is not None:
                 differ["iterations"] = settings.iterations
             differ["budget"] = f"{settings.budget_seconds:g}s"
-        if settings.separate_iterations != SHARING[0]:
+        if settings.separate_iterations != self._own_sharing:
             differ["separate_iterations"] = settings.separate_iterations
+        if settings.validation:
+            differ["validation"] = True
         variant = ",".join(f"{k}={as_typed(v)}" for k, v in differ.items())
         return ResolvedRun.of(replace(job, variant=variant), self.spec, config)
 
@@ -81,13 +99,14 @@ class ResolvedRun:
             stop = StopRule(None, settings.budget_seconds)
         decides = {
             "method": job.method_name,
-            "preset": settings.preset,
+            "preset": settings.preset_name,
             "method_config": deciding_options(config),
             "strategy": job.strategy,
             "stop": dataclasses.asdict(stop),
             "separate_iterations": settings.separate_iterations,
             "max_width": settings.max_width,
             **({"continued_from": job.continued_from} if job.continued_from else {}),
+            **({"validation": True} if settings.validation else {}),
         }
         decides = json.loads(json.dumps(decides))
         document = {
@@ -100,10 +119,12 @@ class ResolvedRun:
         }
         return cls(job, spec, config, stop, document)
 
-    def stops(self, parts: int) -> tuple[StopRule, ...]:
+    def stops(self, parts: Sequence[Part]) -> tuple[StopRule, ...]:
         """Return the end of the training of each model, or of each stage."""
-        each = self.job.settings.separate_iterations == "each"
-        return (self.stop,) * parts if each else self.stop.split(parts)
+        if self.job.settings.separate_iterations != "each":
+            return self.stop.split(len(parts))
+        periods = [{view.period for view in part.train.views} for part in parts]
+        return tuple(self.stop.times(len(own)) for own in periods)
 
 
 def resolve_method(reference: str, spec: MethodSpec, settings: RunSettings) -> ResolvedMethod:

@@ -7,16 +7,20 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.formats.shared.grouping import absolute_rule
+from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.images.store import MAX_WIDTH
+from chronoscene.methods import is_preset_file, preset_name
 
 PHOTO_MEMORY = 2 * 10**9
 PHOTO_DISK = 20 * 10**9
 
 SHARING = ("total", "each")
 """The models of ``separate``, or the stages of ``sequential``, share iterations and time, or each
-get all of them."""
+get all of them. ``each`` is the default of `MethodSpec.per_period`, where it is for ``joint``, too:
+one model of T periods gets them T times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,13 +30,14 @@ class RunSettings:
     runs: Path
     """Folder of all runs."""
     preset: str = "balanced"
+    """Name of a preset of the methods, or path of a preset file."""
     overrides: Mapping[str, str] = field(default_factory=dict)
     """Options of the methods: ``key`` for all that are run, or ``method.key`` for one. Those of a
     job have no prefix."""
     iterations: int | None = None
     budget_seconds: float | None = None
-    separate_iterations: str = "total"
-    """One of `SHARING`."""
+    separate_iterations: str | None = None
+    """One of `SHARING`; None for that of the preset. Those of a run have one."""
     max_width: int = MAX_WIDTH
     """Pixels; wider images are scaled down to it."""
     threads: int | None = None
@@ -40,6 +45,8 @@ class RunSettings:
     """``auto``, ``cpu`` or ``cuda``."""
     period_by: str | None = None
     """Rule by which images are grouped into periods, as for `read_scene`."""
+    validation: bool = False
+    """True if views held back from the training views are scored, and test views are not read."""
     photo_memory: int = PHOTO_MEMORY
     """Bytes that training photos may take in memory, those that are being decoded included."""
     photo_disk: int = PHOTO_DISK
@@ -52,13 +59,19 @@ class RunSettings:
 
     def absolute(self) -> RunSettings:
         """Return the settings with paths that hold in every folder and process."""
-        weights = self.lpips_weights
+        weights, preset = self.lpips_weights, self.preset
         return replace(
             self,
+            preset=str(Path(preset).resolve()) if is_preset_file(preset) else preset,
             runs=self.runs.resolve(),
             period_by=absolute_rule(self.period_by),
             lpips_weights=weights.resolve() if weights else None,
         )
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset in results."""
+        return preset_name(self.preset)
 
     def overrides_of(self, method: str) -> dict[str, str]:
         """Return the options of one method; those with its name win over those of all."""
@@ -102,9 +115,14 @@ class BenchSettings:
             names: Methods that are run.
 
         Raises:
-            ConfigError: If several options give a number of iterations, of which one would win
-                silently, or an override names a method that is not run.
+            ConfigError: If a strategy or a way of sharing is unknown, several options give a number
+                of iterations, of which one would win silently, or an override names a method that
+                is not run.
         """
+        for strategy in self.strategies:
+            check_choice("--strategy", strategy, STRATEGIES)
+        if self.run.separate_iterations is not None:
+            check_choice("--separate-iterations", self.run.separate_iterations, SHARING)
         overrides = self.run.overrides
         given = {
             "--continue-to": self.continue_to,

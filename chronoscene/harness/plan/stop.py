@@ -49,6 +49,11 @@ class StopRule:
         progress = self.progress(iterations, seconds)
         return seconds * (1.0 - progress) / progress if progress > 0 else None
 
+    def times(self, count: int) -> StopRule:
+        """Multiply the iterations and the seconds."""
+        iterations = None if self.iterations is None else self.iterations * count
+        return StopRule(iterations, None if self.seconds is None else self.seconds * count)
+
     def split(self, parts: int) -> tuple[StopRule, ...]:
         """Equal shares for several models; the first ones get what is left over."""
         seconds = None if self.seconds is None else self.seconds / parts

@@ -17,8 +17,7 @@ from chronoscene.harness.files.records import (
     Failure,
     RunRecord,
     read_failures,
-    read_rows,
-    read_run,
+    read_with_rows,
     run_folders,
 )
 from chronoscene.harness.report.intervals import REPLICATES, interval, resampled_means, seed_margin
@@ -111,6 +110,14 @@ COSTS = (
     Cost("peak_device_memory_bytes", "peak GPU memory [MB]", factor=1e-6),
 )
 
+SHARING = (
+    Cost("invariant_share", "invariant [%]", factor=100, decimals=1),
+    Cost("mean_blocks", "blocks each", decimals=2),
+    Cost("mean_period_numbers", "numbers of a period"),
+    Cost("shared_numbers", "of all periods"),
+)
+"""Columns of the table of what periods share, by fields of `PeriodSharing`."""
+
 ENTRY_COLUMNS = (
     *("source", "scene", "method", "strategy", "preset", "variant", "config_hash"),
     *("quantity", "column", "mean", "sd", "n", "low", "high"),
@@ -146,11 +153,6 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
         records += found
         failures += failed
     return records, failures
-
-
-def read_with_rows(folder: Path) -> RunRecord:
-    """Read a finished run with the values of its views."""
-    return read_run(folder).model_copy(update={"rows": read_rows(folder), "folder": folder})
 
 
 def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
@@ -245,7 +247,7 @@ def in_unit(quantity: str, value: float) -> str:
     """Format a value in the unit and with the decimals of the tables; zero has no sign."""
     if quantity in all_metrics():
         return f"{value:z.{all_metrics()[quantity].decimals}f}"
-    (cost,) = (cost for cost in COSTS if cost.name == quantity)
+    (cost,) = (cost for cost in (*COSTS, *SHARING) if cost.name == quantity)
     return f"{value * cost.factor:.{cost.decimals}f}"
 
 
@@ -402,6 +404,8 @@ def _numbers(run: RunRecord, metrics: Sequence[str]) -> Iterator[Number]:
     for cost in COSTS:
         if (value := getattr(run, cost.name)) is not None:
             yield cost.name, "", float(value), UNKNOWN
+    for cost in SHARING if run.sharing is not None else ():
+        yield cost.name, "", float(getattr(run.sharing, cost.name)), UNKNOWN
 
 
 def _scores(

@@ -15,6 +15,7 @@ from chronoscene.harness.report.summary import (
     ENTRY_COLUMNS,
     MEASURED,
     PAPER_METRICS,
+    SHARING,
     SIZE,
     TRANSFERS,
     in_unit,
@@ -152,6 +153,7 @@ def readable_tables(
         # The cost of images that other programs made is unknown.
         if not metrics and (part.column == "").any():
             made.append(_cost_table(part, str(scene), [name for name in shown if name in names]))
+            made += _sharing_tables(part, str(scene))
     return made
 
 
@@ -327,6 +329,14 @@ def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str] = ()) -> Tab
     return _table(title, part.label.unique(), columns)
 
 
+def _sharing_tables(part: DataFrame, scene: str) -> list[Table]:
+    """Make the table of what the periods share in each method that can tell, if any can."""
+    by_quantity = [(cost.title, part[part.quantity == cost.name]) for cost in SHARING]
+    labels = by_quantity[0][1].label.unique()
+    columns = [_Column((title, ""), found) for title, found in by_quantity]
+    return [_table(f"{scene}: what periods share", labels, columns)] if len(labels) else []
+
+
 def footnotes(
     entries: DataFrame,
     records: Sequence[RunRecord],
@@ -354,6 +364,11 @@ def footnotes(
     if len(mixed):
         notes.append(f"seeds of several devices are averaged, costs too: {'; '.join(mixed)}")
     counted = [(r.primitive, r.title) for r in records if r.primitives is not None and not wanted]
+    if entries.quantity.isin([cost.name for cost in SHARING]).any() and not wanted:
+        notes.append(
+            "invariant: primitives with one block of features for all periods; blocks each: mean "
+            "over primitives; numbers: those stored for one period alone, mean over periods"
+        )
     if units := "; ".join(f"{unit} of {titles}" for unit, titles in _grouped(counted)):
         notes.append(f"primitives: {units}")
     absent = []

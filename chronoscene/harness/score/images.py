@@ -121,7 +121,7 @@ def foreign_record(scene: Scene, reason: str, **known: Any) -> records.RunRecord
     """
     costs = (
         *("seconds", "iterations", "primitives"),
-        *("render_seconds", "checkpoint_bytes", "peak_memory_bytes"),
+        *("render_seconds", "checkpoint_bytes", "peak_memory_bytes", "sharing"),
     )
     others = ("parameters", "warmup_seconds", "setup_seconds", "threads")
     unknown = dict.fromkeys((*costs, *others, "peak_device_memory_bytes"))

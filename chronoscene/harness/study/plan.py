@@ -39,7 +39,7 @@ class StudyRow(BaseModel):
     method: str = ""
     """Name, or ``module:SPEC``; empty for the method of the study."""
     strategy: str = "joint"
-    separate_iterations: str = "total"
+    separate_iterations: str | None = None
     options: Mapping[str, Any] = Field(default={}, alias="set")
     """Options of the method, beside those of the preset."""
     published: Mapping[str, Mapping[str, float]] = {}
@@ -109,7 +109,8 @@ def read_study(path: Path) -> Study:
     for row in study.rows:
         place = f"{path}: row {row.label!r}"
         check_choice(f"{place}: strategy", row.strategy, STRATEGIES)
-        check_choice(f"{place}: separate_iterations", row.separate_iterations, SHARING)
+        if row.separate_iterations is not None:
+            check_choice(f"{place}: separate_iterations", row.separate_iterations, SHARING)
         for quantity in chain(*row.published.values()):
             check_choice(f"{place}: published", quantity, quantities)
     return study

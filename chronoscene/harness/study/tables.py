@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chronoscene.harness.files.records import Failure, RunRecord
+from chronoscene.harness.files.records import Failure, RunRecord, read_with_rows
 from chronoscene.harness.report.summary import (
     ENTRY_COLUMNS,
     MEASURED,
@@ -16,7 +16,6 @@ from chronoscene.harness.report.summary import (
     SIZE,
     compare_with,
     in_unit,
-    read_with_rows,
     summarise,
 )
 from chronoscene.harness.report.tables import COST_TITLES, footnotes, interval_text, json_entry

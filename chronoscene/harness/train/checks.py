@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import ChronoSceneError
-from chronoscene.methods import MethodSize, Prediction, StepReport, View
+from chronoscene.methods import MethodSize, PeriodSharing, Prediction, StepReport, View
 
 
 class MethodError(ChronoSceneError):
@@ -41,6 +41,19 @@ def check_size(size: MethodSize, place: str) -> None:
     _check_type(size, MethodSize, place)
     for name in ("primitives", "parameters"):
         _check_number(getattr(size, name), Integral, f"{place}: MethodSize.{name}", "an integer")
+
+
+def check_sharing(sharing: PeriodSharing, size: MethodSize, place: str) -> None:
+    """Check the result of ``sharing``: it adds up to that of ``size``."""
+    _check_type(sharing, PeriodSharing, place)
+    stored = sum(sharing.period_numbers) + sharing.partly_shared_numbers + sharing.shared_numbers
+    for field, unit, found in (
+        ("PeriodSharing.blocks", "primitives", sum(sharing.blocks)),
+        ("PeriodSharing", "parameters", stored),
+    ):
+        wanted = getattr(size, unit)
+        if found != wanted:
+            raise refuse(f"{place}: {field}", f"{wanted} {unit} in all", found)
 
 
 def check_prediction(prediction: Prediction, view: View, place: str) -> None:

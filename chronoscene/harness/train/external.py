@@ -71,7 +71,7 @@ def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> Non
     )
     job.write_source(parts[0].train.training_from_world)
     writer = ImageWriter(staging / records.PREDICTIONS)
-    stops = run.stops(len(parts))
+    stops = run.stops(parts)
     trained = []
     with ProgressDisplay(job.label, report=report) as display:
         for part, stop in zip(parts, stops, strict=True):
@@ -86,7 +86,7 @@ def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> Non
         title=spec.title,
         method=spec.name,
         strategy=job.strategy,
-        preset=settings.preset,
+        preset=settings.preset_name,
         variant=job.variant,
         seed=job.seed,
         seconds=sum(model.seconds for model in trained),

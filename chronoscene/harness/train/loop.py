@@ -29,12 +29,17 @@ PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 NOT_FINITE_LIMIT = 50
 """Steps in a row without a finite loss and finite gradients that end a training."""
 
+_REMEDY = (
+    "lower the learning rates, or take preset paper-scaled instead of paper, if the method has "
+    "one, or report this with the scene"
+)
+
 Clock = Callable[[], float]
 """Return seconds, from any start."""
 
 
 class TrainingError(ChronoSceneError):
-    """A training that cannot continue, since numbers are not finite."""
+    """A training that cannot end in a model."""
 
 
 class DivergedError(TrainingError):
@@ -113,8 +118,8 @@ def train(
 
     Raises:
         DivergedError: If the method skipped too many steps in a row.
-        TrainingError: If it took as many steps with a loss that is not finite, or no view shows
-            the model any more.
+        TrainingError: If it took as many steps with a loss that is not finite, no view shows the
+            model any more, no view ever did, or nothing is left of it.
         CheckpointError: If all checkpoints are damaged.
         MethodError: If the method returns a wrong type or value.
     """
@@ -153,8 +158,13 @@ def train(
             unseen.append(report.loss)
         else:
             unseen.clear()
+        if report.primitives == 0:
+            raise _untrainable(part, state, "a model with something in it", "nothing left")
         if _is_lost(unseen, state):
             raise _lost(part, state.iterations, len(unseen))
+        if state.empty_steps == state.iterations and (done >= 1.0 or len(unseen) == unseen.maxlen):
+            found = f"none in {state.iterations} steps"
+            raise _untrainable(part, state, "a training view that shows something of it", found)
         if due and done >= due[0]:
             due = [share for share in due if share > done]
             state.curve.append(_probe(method, part, truth, state))
@@ -179,8 +189,7 @@ def _was_finite(report: StepReport, state: LoopState) -> bool:
 
 
 def _diverged(report: StepReport, part: Part, last_good: int) -> TrainingError:
-    todo = "lower the learning rates, or report this with the scene"
-    names = ", ".join(report.not_finite)
+    todo, names = _REMEDY, ", ".join(report.not_finite)
     if report.skipped:
         todo = f"the model of iteration {last_good} is kept in checkpoint; {todo}"
     return (DivergedError if report.skipped else TrainingError)(
@@ -203,12 +212,23 @@ def _is_lost(unseen: deque[float], state: LoopState) -> bool:
     return float(np.mean(unseen)) > state.first_loss
 
 
+def _untrainable(part: Part, state: LoopState, expected: str, found: str) -> TrainingError:
+    return TrainingError(
+        f"model {part.name}, iteration {state.iterations}",
+        expected=expected,
+        found=found,
+        todo="check that the sparse points are spread over what the photos show, that these are "
+        "not black or masked throughout (chronoscene validate), and that lengths such as "
+        "near_plane fit the unit of the scene (length_unit=training does in any)",
+    )
+
+
 def _lost(part: Part, iteration: int, count: int) -> TrainingError:
     return TrainingError(
         f"model {part.name}, iteration {iteration}",
         expected="a training view that shows something of the model",
         found=f"{count} steps in a row without, and a larger loss than at the start",
-        todo="lower the learning rates, or report this with the scene",
+        todo=_REMEDY,
     )
 
 

@@ -38,6 +38,7 @@ from chronoscene.harness.plan.resolve import ResolvedRun, resolve
 from chronoscene.harness.plan.stop import StopRule
 from chronoscene.harness.score.scoring import NO_TESTS, score_job
 from chronoscene.harness.train.checkpoints import Checkpoints, LoopState
+from chronoscene.harness.train.checks import check_sharing
 from chronoscene.harness.train.external import run_external
 from chronoscene.harness.train.loop import (
     DivergedError,
@@ -53,8 +54,10 @@ from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.kernels.runtime import check_device, keep_freed_memory, set_threads
-from chronoscene.methods import Method, MethodSize, MethodSpec, import_object
+from chronoscene.methods import Method, MethodSize, MethodSpec, PeriodSharing, import_object
 from chronoscene.scene import Frame, Scene
+
+NOTHING_SHARED = "nothing in the model that periods have of their own and could share"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,7 @@ class PartOutcome:
     size: MethodSize
     render_seconds: float
     """Time for all its test views together, by the model as it was saved and loaded again."""
+    sharing: PeriodSharing | None
     drawn: int | None
     """Gaussians drawn, sum over its test views; None if the method does not report them."""
 
@@ -115,7 +119,7 @@ def run_job(job: Job, report: Report | None = None) -> None:
         if stages:
             writers[records.UNTRAINED] = ImageWriter(staging / records.STAGES / records.UNTRAINED)
             _render_untrained(run, parts, machine, writers[records.UNTRAINED])
-        for part, stop in zip(parts, run.stops(len(parts)), strict=True):
+        for part, stop in zip(parts, run.stops(parts), strict=True):
             display.begin(part.name, stop)
             if not part.extends:
                 method = _new_method(run)
@@ -230,7 +234,10 @@ def _run_part(
     for frame in part.ahead:
         _render_view(loaded, part, frame, writer)
     total = None if None in drawn else sum(drawn)
-    return PartOutcome(trained, saved, loaded.size(), seconds, total)
+    size, sharing = loaded.size(), loaded.sharing() if hasattr(loaded, "sharing") else None
+    if sharing is not None:
+        check_sharing(sharing, size, f"model {part.name}")
+    return PartOutcome(trained, saved, size, seconds, sharing, total)
 
 
 def _checkpoints(run: ResolvedRun, part: Part, parts: int, display: ProgressDisplay) -> Checkpoints:
@@ -291,6 +298,9 @@ def _record(
     # The stages of a training leave one model.
     models = outcomes[-1:] if STRATEGIES[job.strategy].in_order else outcomes
     drawn = [model.drawn for model in models]
+    absent = {} if tests else dict.fromkeys(("drawn", "render_seconds"), NO_TESTS)
+    if len(models) > 1 or models[0].sharing is None:
+        absent["sharing"] = NOTHING_SHARED
     return records.RunRecord(
         method=spec.name,
         strategy=job.strategy,
@@ -305,15 +315,16 @@ def _record(
         resumed=max(o.trained.resumed for o in outcomes),
         primitives=sum(model.size.primitives for model in models),
         primitive=outcomes[0].size.unit,
+        sharing=models[0].sharing if len(models) == 1 else None,
         drawn=None if None in drawn or not tests else sum(filter(None, drawn)) / tests,
         checkpoint_bytes=sum(records.size_of(model.folder) for model in models),
         peak_memory_bytes=peaks[0],
         device=describe_device(machine.device, machine.threads),
         commit="; ".join(dict.fromkeys([*code, job.commit])),
         skipped={},
-        absent={} if tests else dict.fromkeys(("drawn", "render_seconds"), NO_TESTS),
-        title=spec.title,
-        preset=job.settings.preset,
+        absent=absent,
+        title=spec.title_of(job.settings.preset_name),
+        preset=job.settings.preset_name,
         variant=job.variant,
         method_version=method_version(job.method),
         config_hash=run.document["config_hash"],

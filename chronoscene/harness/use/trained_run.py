@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
-from chronoscene.formats import read_scene
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.records import (
@@ -22,7 +21,7 @@ from chronoscene.harness.files.records import (
     read_config,
     read_run,
 )
-from chronoscene.harness.files.source import RunSource, read_source
+from chronoscene.harness.files.source import RunSource, read_bench_scene, read_source
 from chronoscene.harness.files.strategies import STRATEGIES, Strategy, period_part
 from chronoscene.harness.score.views import PredictedView, read_views
 from chronoscene.images.store import ImageStore
@@ -295,7 +294,12 @@ class TrainedRun:
         place, found = root or Path(self.source.scene_root), "nothing"
         if place.exists():
             source = self.source
-            scene = read_scene(place, format=source.scene_format, period_by=source.period_by)
+            scene = read_bench_scene(
+                place,
+                format=source.scene_format,
+                period_by=source.period_by,
+                validation=source.validation,
+            )
             if scene_hash(scene) == self.record.scene_hash:
                 return scene
             found = "another scene, or a changed one"

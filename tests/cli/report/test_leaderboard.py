@@ -18,5 +18,5 @@ def test_from_a_run_to_a_site(tmp_path):
     assert f"wrote {entry}" in done.stderr
     done = invoke("leaderboard", tmp_path / "entries", "--out", tmp_path / "site")
     assert done.exit_code == 0, done.output
-    assert done.stdout == "1 measured entries, 0 of them with pictures\n"
+    assert done.stdout == "1 measured entries: 0 of older code, 0 with pictures\n"
     assert (tmp_path / "site/scene/plaza.html").is_file()

@@ -113,8 +113,8 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
     make_scene_folder, tmp_path, monkeypatch, set_gsplat
 ):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    reader = "chronoscene.harness.plan.plan.read_scene"
-    monkeypatch.setattr(reader, lambda path: pytest.fail("read"))
+    reader = "chronoscene.harness.plan.plan.read_bench_scene"
+    monkeypatch.setattr(reader, lambda *args, **options: pytest.fail("read"))
     command = ["bench", str(make_scene_folder()), "--method", "3dgs", "--out", str(tmp_path / "r")]
     result = CliRunner().invoke(cli, [*command, "--device", "cuda"])
     assert isinstance(result.exception, BackendError)

@@ -74,7 +74,9 @@ def test_shares_add_up(iterations, parts):
     assert max(shares) - min(shares) <= 1
 
 
-def test_budgets_are_shared():
+def test_budgets_are_shared_or_repeated():
+    assert StopRule(7, 9.0).times(3) == StopRule(21, 27.0)
+    assert StopRule(None, 9.0).times(2) == StopRule(None, 18.0)
     assert StopRule(None, 9.0).split(3) == (StopRule(None, 3.0),) * 3
     assert StopRule(7, 9.0).split(3) == (StopRule(3, 3.0), StopRule(2, 3.0), StopRule(2, 3.0))
 

@@ -273,3 +273,11 @@ def test_methods_without_period_run_pooled_with_a_notice():
     assert effective_strategy(mean, "joint") == ("joint", None)
     with pytest.raises(ConfigError, match="joint, pooled, separate"):
         effective_strategy(mean, "together")
+
+
+def test_points_in_one_place_are_refused(make_scene):
+    scene = make_scene()
+    points = replace(scene.points, xyz=np.ones_like(scene.points.xyz))
+    message = "expected sparse points in different places, found 11 in one place; triangulate"
+    with pytest.raises(SceneError, match=message):
+        parts_of(replace(scene, points=points), "joint")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from chronoscene.methods import MethodSize, MethodSpec, Prediction, StepReport
+from chronoscene.methods import MethodSize, MethodSpec, Prediction, Range, StepReport
 
 
 @dataclass(frozen=True)
@@ -161,8 +161,13 @@ def spec(name, cls, period_input="label"):
 
 
 MEAN = spec("mean", MeanColour)
+TUNED = replace(
+    spec("tuned", MeanColour),
+    search={"rate": Range(0.001, 1.0), "ballast": Range(0, 9, "int"), "sleep": (0.0, 1e-6)},
+)
 FIXED = spec("fixed", FixedPeriods)
 DRAWING = spec("drawing", Drawing)
+DATED = replace(spec("dated", MeanColour), per_period=("balanced",))
 BLIND = spec("blind", MeanColour, period_input="none")
 RAISES = spec("raises", Raises)
 NOT_FINITE = replace(

@@ -15,6 +15,7 @@ from chronoscene.harness.report.summary import ENTRY_COLUMNS, in_region, summari
 from chronoscene.harness.report.tables import footnotes, format_runs, period_name, readable_tables
 from chronoscene.harness.score.forgetting import transfer
 from chronoscene.io.tables import FORMATS
+from chronoscene.methods import PeriodSharing
 
 RUNS = [
     record(seed=0, psnr=(20.0, 30.0), ssim=(0.5, 0.75)),
@@ -56,6 +57,16 @@ def test_tables_mark_the_best_of_each_column():
     # chronogs: 21, 30.5, 25.75, 25.75, 21; 3dgs: 10, 40, 25, 25, 10.
     assert quality.ranks == dict.fromkeys([(0, 1), (0, 3), (0, 4), (0, 5), (1, 2)], 1)
     assert [row[-1] for row in quality.rows] == ["2", "1"]
+
+
+def test_what_periods_share_stands_where_it_is_known():
+    shares = PeriodSharing((3, 1), (10, 20), 0, 70)
+    *_, table = grids([*RUNS, record("a", sharing=shares), record("a", seed=1, sharing=shares)])
+    assert table.title == "plaza: what periods share"
+    assert [row[1:] for row in table.rows] == [["75.0 ± 0.0", "1.25 ± 0.00", "15 ± 0", "70 ± 0"]]
+    assert table.rows[0][0] == "A (joint, fast)"
+    assert grids(RUNS)[-1].title == "plaza: macro means and cost"
+    assert len(notes([record("a", sharing=shares)], [])) == len(notes([record("a")], [])) + 1
 
 
 def test_lower_is_better_where_it_is():

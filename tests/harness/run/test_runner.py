@@ -257,6 +257,21 @@ def test_separate_models_and_stages_share_or_repeat(bench, strategy):
     assert any(line.endswith("has all iterations and time") for line in said)
 
 
+def test_presets_may_mean_their_iterations_for_each_period(bench):
+    """Two periods: 18 steps, of which each model or stage of one period does 9."""
+    strategies = ("joint", "separate", "sequential", "pooled")
+    each, said = bench("DATED", strategies=strategies, iterations=9)
+    assert [read_run(folder).iterations for folder in each.finished] == [18, 18, 18, 9]
+    assert {read_run(folder).variant for folder in each.finished} == {"iterations=9"}
+    assert any(line.endswith("once for each period") for line in said)
+    total, _ = bench("DATED", strategies=strategies, iterations=9, separate_iterations="total")
+    assert [read_run(folder).iterations for folder in total.finished] == [9] * 4
+    variant = "iterations=9,separate_iterations=total"
+    assert {read_run(folder).variant for folder in total.finished} == {variant}
+    hashes = [read_run(folder).config_hash for folder in (*each.finished, *total.finished)]
+    assert len(set(hashes)) == 8
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -76,7 +76,7 @@ def test_mistakes_in_a_file_are_named(study_file, old, new, message):
 def test_the_example_of_the_documentation_is_a_study(study_file):
     text = (Path(__file__).parents[3] / "docs/guides/studies.md").read_text()
     study = read_study(study_file(text.split("```toml")[1].split("```")[0]))
-    assert [row.separate_iterations for row in study.rows] == ["total", "total", "each"]
+    assert [row.separate_iterations for row in study.rows] == [None, None, "each"]
 
 
 def test_a_file_that_is_not_there_and_a_name_that_is_unknown(tmp_path):

@@ -5,8 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.harness.train.checks import MethodError, check_prediction, check_size, check_step
-from chronoscene.methods import MethodSize, Prediction, StepReport, View
+from chronoscene.harness.train.checks import (
+    MethodError,
+    check_prediction,
+    check_sharing,
+    check_size,
+    check_step,
+)
+from chronoscene.methods import MethodSize, PeriodSharing, Prediction, StepReport, View
 
 VIEW = View(np.eye(3), 6, 4, np.eye(4))
 GREY = Prediction(np.zeros((4, 6, 3), np.float32), np.ones((4, 6), np.float32), drawn=3)
@@ -15,6 +21,7 @@ GREY = Prediction(np.zeros((4, 6, 3), np.float32), np.ones((4, 6), np.float32), 
 def test_what_is_right_passes():
     check_step(StepReport(float("nan"), np.int64(3), "not finite"), "step 1")
     check_size(MethodSize(1, np.int32(2)), "size")
+    check_sharing(PeriodSharing((1, 2), (4, 5), 6, 7), MethodSize(3, 22), "sharing")
     check_prediction(GREY, VIEW, "render")
     check_prediction(replace(GREY, alpha=None, drawn=None), VIEW, "render")
 
@@ -34,6 +41,20 @@ def test_what_is_right_passes():
 def test_numbers(check, value, message):
     with pytest.raises(MethodError) as error:
         check(value, "at")
+    assert str(error.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("sharing", "message"),
+    [
+        (None, "at: expected a PeriodSharing, found NoneType;"),
+        (PeriodSharing((1, 1), (4, 5), 6, 7), "at: PeriodSharing.blocks: expected 3 primitives in"),
+        (PeriodSharing((1, 2), (4, 5), 6, 6), "at: PeriodSharing: expected 22 parameters in all"),
+    ],
+)
+def test_what_is_shared_adds_up(sharing, message):
+    with pytest.raises(MethodError) as error:
+        check_sharing(sharing, MethodSize(3, 22), "at")
     assert str(error.value).startswith(message)
 
 

@@ -173,14 +173,14 @@ def test_whichever_limit_is_first(part, clock):
     assert run(method, part, StopRule(10**6, 1.0), now=clock).iterations == 4
 
 
-def reporting(skipped_at, loss=math.nan, skipped="not finite"):
+def reporting(skipped_at, loss=math.nan, skipped="not finite", primitives=1):
     """A method that reports some of its steps as skipped."""
     method = toy()
     step = method.step
 
     def reported(index, progress):
         names = ("means",) if skipped == "not finite" else ()
-        report = StepReport(loss, 1, skipped, names)
+        report = StepReport(loss, primitives, skipped, names)
         return report if index in skipped_at else step(index, progress)
 
     method.step = reported
@@ -190,8 +190,8 @@ def reporting(skipped_at, loss=math.nan, skipped="not finite"):
 def test_steps_that_taught_nothing_are_counted(part):
     trained = run(reporting({3, 4, 9}), part, StopRule(20, None))
     assert (trained.iterations, trained.empty_steps, trained.skipped_steps) == (20, 0, 3)
-    trained = run(reporting(range(20), 0.5, "empty"), part, StopRule(20, None))
-    assert (trained.iterations, trained.empty_steps, trained.skipped_steps) == (20, 20, 0)
+    trained = run(reporting(range(1, 20), 0.1, "empty"), part, StopRule(20, None))
+    assert (trained.iterations, trained.empty_steps, trained.skipped_steps) == (20, 19, 0)
 
 
 def test_only_a_run_of_steps_that_are_not_finite_ends_the_training(part):
@@ -223,6 +223,19 @@ def test_a_model_that_no_view_shows_any_more_ends_the_training(part):
     assert run(reporting(range(7, 400), better, "empty"), part, StopRule(400, None)).iterations
     often = [i for i in range(1, 400) if i % count]
     assert run(reporting(often, worse, "empty"), part, StopRule(400, None)).empty_steps
+
+
+@pytest.mark.parametrize("steps", [20, 400])
+def test_a_model_that_no_view_ever_showed_is_no_result(part, steps):
+    count = min(steps, NOT_FINITE_LIMIT)
+    with pytest.raises(TrainingError, match=f"found none in {count} steps; check that the sparse"):
+        run(reporting(range(400), 0.1, "empty"), part, StopRule(steps, None))
+
+
+def test_a_model_with_nothing_in_it_is_no_result(part):
+    message = r"iteration 8: expected a model with something in it, found nothing left; check that"
+    with pytest.raises(TrainingError, match=message):
+        run(reporting({7}, 0.1, None, primitives=0), part, StopRule(20, None))
 
 
 def test_images_that_are_not_finite_are_refused(part):

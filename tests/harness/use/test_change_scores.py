@@ -84,6 +84,7 @@ def test_a_scene_without_truth(run):
 
 def test_a_model_for_each_period(trained):
     run = open_run(trained["4dgs"])
+    assert run.record.sharing is None and "sharing" in run.record.absent
     ((made, _),) = map_run(run, run.scene(), [(0, 1)])
     assert made.later.any()
     assert not made.later.all()
@@ -106,6 +107,9 @@ def test_the_command_writes_a_folder(run, scene, tmp_path):
     result = changes(run.folder, "--scene", scene.root, "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert "ring: chronogs joint fast iterations=12 seed 0" in result.stdout
+    blocks = run.record.sharing.blocks
+    assert sum(blocks) == run.record.primitives and "sharing" not in run.record.absent
+    assert f"of its {sum(blocks):,} anchors" in result.stdout
     out = {path.name for path in (tmp_path / "out").iterdir()}
     assert out == {"changes.csv", "changes.png", "changes_0_1.ply"}
     (row,) = csv.DictReader((tmp_path / "out/changes.csv").open())

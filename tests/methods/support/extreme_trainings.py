@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from chronoscene.methods import Method, MethodSpec, StepReport, build_config, im
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 
-PRESET = "fast"
+ROUNDS = 10  # Of density control in a whole training; growth ends halfway
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,15 @@ class Extreme:
 
     name: str
     periods: int = 3
-    photos: int = 5
-    """Per period."""
+    photos: int | tuple[int, ...] = 5
+    """Per period, or those of each."""
     points: int = 280
     points_apart: bool = True
     cameras_apart: bool = True
     origin: float = 0.0
     """Distance of the scene from the origin of the world, in radii of the ring of cameras."""
+    unit: float = 1.0
+    """Radius of the ring of cameras in the world."""
     size: float = 1.0
     """Of the photos; times 40 x 30 px."""
     level: int | None = None
@@ -49,23 +52,42 @@ class Extreme:
     rates: float = 1.0
     """Factor of all learning rates."""
     steps: int = 100
+    advice: str | None = None
+    """Part of the message of an error in which a training may end."""
+    cheap: bool = True
+    """False for those that the tests leave to the benchmark."""
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Photos of each period."""
+        photos = self.photos
+        return photos if isinstance(photos, tuple) else (photos,) * self.periods
 
 
 EXTREMES = (
     Extreme("none of them"),
     Extreme("1 period", periods=1),
+    Extreme("2 periods", periods=2),
     Extreme("40 periods of 2 photos", periods=40, photos=2),
+    Extreme("300 periods of 2 photos", periods=300, photos=2, cheap=False),
+    Extreme("1,000 periods of 2 photos", periods=1000, photos=2, cheap=False),
     Extreme("3 periods of 1 photo", photos=1),
-    Extreme("3 points", points=3),
-    Extreme("1,000,000 points", points=1_000_000, steps=1),
-    Extreme("all points in one place", points_apart=False),
+    Extreme("1 photo beside 500", periods=2, photos=(1, 500), cheap=False),
+    # Their Gaussians are so large that density control splits or prunes them all.
+    Extreme("3 points", points=3, advice="check that the sparse points"),
+    Extreme("1,000,000 points", points=1_000_000, steps=1, cheap=False),
+    Extreme("all points in one place", points_apart=False, advice="triangulate"),
     Extreme("all cameras in one place", cameras_apart=False),
     Extreme("1,000,000 units from the origin", origin=1e6),
+    Extreme("a scene of 1,000,000 m", unit=1e6),
+    Extreme("a scene of 0.001 m", unit=1e-3),
     Extreme("photos of 16 x 12 px", size=0.4),
-    Extreme("photos of 6,000 x 4,500 px", size=150.0, steps=1),
-    Extreme("black photos", level=0),
+    Extreme("photos of 64 x 48 px", size=1.6),
+    Extreme("photos of 4,000 x 3,000 px", size=100.0, steps=4, cheap=False),
+    Extreme("black photos", level=0, advice="check that the sparse points"),
     Extreme("white photos", level=255),
-    Extreme("learning rates times 100", rates=100.0),
+    # A step that is too long may leave a model that no view shows.
+    Extreme("learning rates times 100", rates=100.0, advice="lower the learning rates"),
 )
 
 
@@ -106,18 +128,19 @@ class Photos:
         """All are at hand."""
 
 
-def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
-    """The scene as the method gets it."""
+@lru_cache(maxsize=1)
+def make_scene(extreme: Extreme) -> tuple[Scene, Photos]:
+    """The scene and its photos."""
     centres, radii, colors = painted_balls.make_balls(extreme.periods)
-    offset = np.array([extreme.origin, 0.0, 0.0])
+    offset = extreme.unit * np.array([extreme.origin, 0.0, 0.0])
     painted_size = min(extreme.size, 1.0)
     repeats = round(extreme.size / painted_size)
     frames: list[Frame] = []
     images: dict[str, NDArray[np.uint8]] = {}
-    for index in range(extreme.periods * extreme.photos):
-        period, number = divmod(index, extreme.photos)
-        name = f"{period:02}_{number}.png"
-        share = (number + period / max(extreme.periods, 2)) / extreme.photos
+    shots = [(period, i) for period, count in enumerate(extreme.counts) for i in range(count)]
+    for index, (period, number) in enumerate(shots):
+        name = f"{period:04}_{number:04}.png"
+        share = (number + period / max(extreme.periods, 2)) / extreme.counts[period]
         view = painted_balls.make_view(2 * np.pi * share, period, name)
         if not extreme.cameras_apart:
             # Turned a little about the centre of the first one.
@@ -136,6 +159,7 @@ def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
         params = repeats * np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
         camera = Camera(1, "PINHOLE", width * repeats, height * repeats, tuple(params.tolist()))
         pose = view.cam_from_world.copy()
+        pose[:3, 3] *= extreme.unit
         pose[:3, 3] -= pose[:3, :3] @ offset
         frames.append(Frame(name, index, camera, pose, period, "train"))
     # The harness tests some of the training views.
@@ -147,10 +171,10 @@ def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
     rng = np.random.default_rng(12)
     ball = np.arange(extreme.points) % len(centres)
     xyz = centres[ball] + rng.normal(0, 0.4, (len(ball), 3)) * radii[ball, None]
-    seen = np.arange(extreme.periods, dtype=np.int32) * extreme.photos
+    seen = np.cumsum((0, *extreme.counts[:-1]), dtype=np.int32)
     points = Points(
         ids=np.arange(len(ball)),
-        xyz=xyz * extreme.points_apart + offset,
+        xyz=xyz * extreme.points_apart * extreme.unit + offset,
         rgb=np.rint(255 * colors[0][ball]).astype(np.uint8),
         error=np.zeros(len(ball)),
         track_start=np.arange(len(ball) + 1) * extreme.periods,
@@ -167,14 +191,25 @@ def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
         split_rule="",
         format="",
     )
+    return scene, Photos(images)
+
+
+def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
+    """The scene as the method gets it."""
+    scene, photos = make_scene(extreme)
     strategy, _ = effective_strategy(spec, "joint")
-    photos: Any = Photos(images)
-    return make_parts(scene, photos, strategy)[0]
+    store: Any = photos
+    return make_parts(scene, store, strategy)[0]
 
 
-def make_config(extreme: Extreme, spec: MethodSpec) -> Any:
-    """The preset with other learning rates, if so wanted."""
-    config = build_config(spec, preset=PRESET, overrides={"iterations": extreme.steps})
+def make_config(extreme: Extreme, spec: MethodSpec, preset: str) -> Any:
+    """The preset with its whole schedule in few steps, and other learning rates, if so wanted."""
+    options = {f.name for f in dataclasses.fields(import_object(spec.config))}
+    interval = "density_interval" if "density_interval" in options else "densify_interval"
+    overrides = {"iterations": extreme.steps, interval: max(1, extreme.steps // ROUNDS)}
+    if "stretch" in options:
+        overrides["stretch"] = True
+    config = build_config(spec, preset=preset, overrides=overrides)
     rates = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if "_lr" in f.name}
     return dataclasses.replace(
         config,
@@ -193,14 +228,14 @@ def score(method: Method, part: Part) -> float:
     return float(np.mean([psnr(render_bytes(method, part, f), load(f)) for f in part.test]))
 
 
-def run(extreme: Extreme, spec: MethodSpec) -> Outcome:
+def run(extreme: Extreme, spec: MethodSpec, preset: str) -> Outcome:
     """Train one method as the harness does."""
-    part, config = make_part(extreme, spec), make_config(extreme, spec)
     reports: list[StepReport] = []
     error, clear = None, True
     before = after = math.nan
     started = time.perf_counter()
     try:
+        part, config = make_part(extreme, spec), make_config(extreme, spec, preset)
         method: Method = import_object(spec.method)(config)
         method.setup(part.train, seed=0, device="cpu")
         before = score(method, part)

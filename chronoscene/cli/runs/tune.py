@@ -1,0 +1,49 @@
+"""``chronoscene tune``: search for options of a method on views held back from the training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chronoscene.cli.options import FOLDER, add_options, look_here_for, reading_options
+from chronoscene.cli.output import emit, report_written, terminal_width
+from chronoscene.cli.runs.bench import settings_from
+from chronoscene.harness.files.strategies import STRATEGIES
+from chronoscene.harness.tune.report import PRESET_FILE, TRIALS_FILE, trials_table
+from chronoscene.harness.tune.search import tune
+from chronoscene.io.tables import boxed_text
+
+
+@click.command("tune")
+@click.argument("method")
+@click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
+@click.option(
+    "--trials",
+    type=click.IntRange(min=1),
+    required=True,
+    help="Number of trials in all, failed ones among them.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of search and trainings.")
+@click.option(
+    "--strategy", default="joint", type=click.Choice([*STRATEGIES]), help="Strategy of the trials."
+)
+@reading_options("the scenes")
+@add_options("preset", "iterations", "jobs", "job_memory", "ray", "threads", "device")
+@click.option("--out", type=FOLDER, required=True, help="Folder for the search.")
+def command(method: str, trials: int, seed: int, strategy: str, out: Path, **options: Any) -> None:
+    """Search for options by scores on validation views.
+
+    Each trial trains METHOD on each scene with other options, as bench --validation does it; the
+    first has those of the preset. The mean PSNR decides. --out gets preset.toml with the best
+    options, which bench takes as --preset, and trials.csv. The same command goes on after an
+    interruption, or with more --trials. docs/guides/tuning.md describes what is searched.
+    """
+    look_here_for([method])
+    settings = settings_from(
+        methods=(method,), strategies=(strategy,), seeds=(seed,), out=out, assignments=(), **options
+    )
+    results = tune(settings, trials, lambda line: click.echo(line, err=True))
+    emit(boxed_text(trials_table(results), width=terminal_width(None)), None)
+    report_written(out / PRESET_FILE, out / TRIALS_FILE)

@@ -1,0 +1,281 @@
+"""Trials of a search, one after the other or several at a time, and what is kept of them."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files import records
+from chronoscene.harness.files.provenance import scene_hash
+from chronoscene.harness.files.source import read_bench_scene
+from chronoscene.harness.plan.finished import first_difference
+from chronoscene.harness.plan.job import Job
+from chronoscene.harness.plan.plan import Plan, plan_runs
+from chronoscene.harness.plan.resolve import ResolvedMethod, deciding_options, resolve_method
+from chronoscene.harness.plan.settings import BenchSettings
+from chronoscene.harness.run.local_pool import LocalPool, Pool, open_pool
+from chronoscene.harness.run.progress import RunsDisplay
+from chronoscene.harness.run.runner import BenchOutcome, Execute, run_plan
+from chronoscene.harness.tune.report import TrialResult, best_of, read_results, write_report
+from chronoscene.io.log import Log
+from chronoscene.methods import as_typed, load_spec
+from chronoscene.methods.search_space import draw, starting_point
+
+if TYPE_CHECKING:
+    from optuna.study import Study
+    from optuna.trial import Trial
+
+JOURNAL = "study.journal"
+TRIALS = "trials"
+SETTINGS = "settings"
+"""Attribute of the study."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """A search that is open."""
+
+    settings: BenchSettings
+    """Settings of a trial, but for its folder and its options."""
+    out: Path
+    method: ResolvedMethod
+    seed: int
+    study: Study
+    about: dict[str, Any]
+    """Values that identify the search: one with others needs another folder."""
+
+    def results(self) -> list[TrialResult]:
+        """Write the report; return the trials that have ended."""
+        results = read_results(self.study, self.method)
+        write_report(results, self.method, self.about, self.out)
+        return results
+
+    def trial_settings(self, trial: Trial) -> BenchSettings:
+        """Return the settings of the bench of a trial."""
+        drawn = draw(trial, self.method.spec, self.method.config)
+        run = replace(
+            self.settings.run,
+            runs=self.out / TRIALS / f"{trial.number:03d}",
+            overrides={name: as_typed(value) for name, value in drawn.items()},
+        )
+        return replace(self.settings, run=run)
+
+
+def tune(
+    settings: BenchSettings, trials: int, log: Log, *, execute: Execute | None = None
+) -> list[TrialResult]:
+    """Search for options with the best mean PSNR on validation views.
+
+    Equal arguments give equal trials, one at a time. A search that was killed goes on where it
+    was, as does one whose number of trials is raised.
+
+    Args:
+        settings: One method, strategy and seed; scenes, preset, machine; its folder of runs becomes
+            that of the search.
+        trials: Number of trials in all, failed ones among them. The first is the preset as it is.
+        log: Called with lines for the user.
+        execute: As for `run_bench`.
+
+    Returns:
+        All trials. ``trials.csv`` in the folder has them, and ``preset.toml`` the best one.
+
+    Raises:
+        ConfigError: If Optuna is missing, the method has no search space, the folder has a search
+            with other settings, or no trial has a result.
+        ChronoSceneError: As for `run_bench`.
+    """
+    out = settings.run.runs
+    out.mkdir(parents=True, exist_ok=True)
+    with _alone(out):
+        search = _open(settings, out, log)
+        missing = trials - sum(trial.state.is_finished() for trial in search.study.trials)
+        if missing > 0:
+            _run_trials(search, trials, missing, log, execute)
+        results = search.results()
+    if best_of(results) is None:
+        raise ConfigError(
+            f"tune {search.method.spec.name}",
+            expected="a trial with a result",
+            found=f"none; the first one ended so: {results[0].failure}",
+            todo="correct that, and choose another folder with --out",
+        )
+    return results
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    try:
+        with FileLock(out / ".lock").acquire(blocking=False):
+            yield
+    except Timeout as error:
+        raise ConfigError(
+            f"--out {out}",
+            expected="a folder that no other command searches in",
+            found="one that is at work",
+            todo="wait for it, or choose another folder",
+        ) from error
+
+
+def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
+    """Open the study of a folder, or begin it with the preset as its first trial."""
+    try:
+        import optuna
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
+    except ImportError as error:
+        raise ConfigError(
+            "chronoscene tune",
+            expected="the package optuna",
+            found=str(error),
+            todo="pip install 'chronoscene[tune]'",
+        ) from error
+    settings = replace(settings, run=replace(settings.run.absolute(), validation=True))
+    (reference,), (seed,), run = settings.methods, settings.seeds, settings.run
+    method = resolve_method(reference, load_spec(reference), run)
+    start = starting_point(method.spec, method.config)
+    scenes = []
+    for path in settings.scenes:
+        log(f"read {path}")
+        scene = read_bench_scene(
+            path, format=settings.dataset_format, period_by=run.period_by, validation=True
+        )
+        scenes.append({"name": scene.name, "hash": scene_hash(scene)})
+    ours = {
+        "method": method.spec.name,
+        "preset": run.preset_name,
+        "iterations": method.config.iterations,
+        "options": deciding_options(method.config),
+        "space": {
+            name: list(space) if isinstance(space, tuple) else [space.low, space.high, space.kind]
+            for name, space in method.spec.search.items()
+        },
+        "scenes": scenes,
+        "strategy": settings.strategies[0],
+        "max_width": run.max_width,
+        "seed": seed,
+    }
+    ours = json.loads(json.dumps(ours))  # as it is read again
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = JournalStorage(JournalFileBackend(str(out / JOURNAL)))
+    study = optuna.create_study(
+        storage=storage, study_name="tune", direction="maximize", load_if_exists=True
+    )
+    stored = study.user_attrs.get(SETTINGS)
+    if stored is None:
+        study.set_user_attr(SETTINGS, ours)
+    elif stored != ours:
+        old, new = first_difference(stored, ours)
+        raise ConfigError(
+            f"--out {out}",
+            expected=f"a search with {new}",
+            found=f"one with {old}",
+            todo="choose another folder",
+        )
+    if not study.trials:
+        study.enqueue_trial(start)
+    return _Search(settings, out, method, seed, study, ours)
+
+
+def _run_trials(
+    search: _Search, trials: int, missing: int, log: Log, execute: Execute | None
+) -> None:
+    queue = _queue(search, trials)
+    under_way: dict[Future[BenchOutcome], Trial] = {}
+    with open_pool(search.settings) as opened:
+        pool = opened or LocalPool(1)
+        total = missing * len(search.settings.scenes)
+        with RunsDisplay(total, log) as display, ThreadPoolExecutor(pool.at_once) as threads:
+            try:
+                while True:
+                    while len(under_way) < pool.at_once and (trial := next(queue, None)):
+                        settings = search.trial_settings(trial)
+                        plan = plan_runs(settings, _silent)
+                        future = threads.submit(_run, plan, settings, pool, display, execute)
+                        under_way[future] = trial
+                    if not under_way:
+                        return
+                    for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                        _finish(search, under_way.pop(future), future.result(), display.log)
+            except BaseException:
+                pool.stop.ask()
+                raise
+
+
+def _silent(line: str) -> None:
+    """Drop a line: the display has its own."""
+
+
+def _queue(search: _Search, trials: int) -> Iterator[Trial]:
+    """Yield trials to run: first those that a killed search has left, then new ones.
+
+    Each has a sampler of its own, seeded by its number, so that a search that goes on draws what it
+    would have drawn.
+    """
+    import optuna
+
+    study, running = search.study, optuna.trial.TrialState.RUNNING
+    left = [trial for trial in study.trials if trial.state == running]
+    begun = sum(trial.state != optuna.trial.TrialState.WAITING for trial in study.trials)
+    for number in (*(trial.number for trial in left), *range(begun, trials)):
+        seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
+        study.sampler = optuna.samplers.TPESampler(seed=seed)
+        if number < begun:
+            yield optuna.trial.Trial(study, study.trials[number]._trial_id)
+        else:
+            yield study.ask()
+
+
+def _run(
+    plan: Plan, settings: BenchSettings, pool: Pool, display: RunsDisplay, execute: Execute | None
+) -> BenchOutcome:
+    """Run the scenes of a trial, in a thread of its own."""
+
+    def in_pool(job: Job) -> records.Failure | None:
+        with display.showing(job.label) as report:
+            return pool.run(job, report)
+
+    return run_plan(plan, settings, _silent, execute=execute or in_pool)
+
+
+def _finish(search: _Search, trial: Trial, outcome: BenchOutcome, log: Log) -> None:
+    """Record the result of a trial, and delete what it was made from."""
+    from optuna.trial import TrialState
+
+    runs = [records.read_run(folder) for folder in outcome.finished]
+    values = [run.aggregates["macro"]["psnr"] for run in runs]
+    value = sum(values) / len(values) if values else math.nan
+    reason = "; ".join(failure.reason for failure in outcome.failures)
+    if not reason and not math.isfinite(value):
+        reason = f"PSNR is {value}"
+    for name, found in (
+        ("seconds", sum(run.seconds or 0.0 for run in runs)),
+        ("bytes", sum(run.checkpoint_bytes or 0 for run in runs)),
+        ("device", "; ".join(sorted({run.device for run in runs}))),
+        ("commit", "; ".join(sorted({run.commit for run in runs}))),
+        ("failure", reason),
+    ):
+        trial.set_user_attr(name, found)
+    if reason:
+        search.study.tell(trial, state=TrialState.FAIL)
+        log(f"trial {trial.number} failed: {reason}")
+    else:
+        search.study.tell(trial, value)
+        best = search.study.best_trial
+        log(f"trial {trial.number}: {value:.3f} dB; best {best.value:.3f} dB ({best.number})")
+    folder = search.out / TRIALS / f"{trial.number:03d}"
+    parts = (records.CHECKPOINT, records.PREDICTIONS, records.STAGES)
+    bulky = [path for part in parts for path in folder.glob(f"*/*/seed*/{part}")]
+    for path in (folder / records.GROUND_TRUTH, folder / records.PHOTOS, *bulky):
+        shutil.rmtree(path, ignore_errors=True)
+    search.results()

@@ -1,0 +1,105 @@
+"""Scenes with a role, fixed by hashes: presets are tuned on some, methods are ranked on others.
+
+    python -m leaderboard.scenes FOLDER [NAME...] [--role ranking]
+
+makes the generated ones in FOLDER, checks those that are there, and names those that differ from
+``scenes.toml``. A scene that cannot be generated is checked on request, by its name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import ChronoSceneError, SceneError
+from chronoscene.formats import read_scene
+from chronoscene.harness.files.provenance import scene_hash
+from chronoscene.scene.splits import split_hash
+from chronoscene.synth import SynthSettings, generate
+
+ROLES = {
+    "ranking": "a ranking scene: no trial of any preset has used it",
+    "tuning": "a tuning scene: presets are chosen on views of it",
+    "seen": "a scene whose test views were looked at when presets were chosen: no ranking",
+}
+"""Roles, and what they mean for a result."""
+
+
+@dataclass(frozen=True, slots=True)
+class FixedScene:
+    """A scene of the table."""
+
+    role: str
+    """One of `ROLES`."""
+    about: str
+    """One line."""
+    scene_hash: str
+    split_hash: str
+    synth: dict[str, Any] | None = None
+    """Settings that generate it; None if it is made by hand."""
+    made: str = ""
+    """Its source and the commands, if it is made by hand."""
+
+
+def fixed_scenes() -> dict[str, FixedScene]:
+    """Read the table: scenes by name."""
+    text = Path(__file__).with_name("scenes.toml").read_text(encoding="utf-8")
+    return {name: FixedScene(**fields) for name, fields in tomllib.loads(text).items()}
+
+
+def role_of(digest: str) -> str:
+    """Describe the role of the scene with a `scene_hash`."""
+    roles = {scene.scene_hash: ROLES[scene.role] for scene in fixed_scenes().values()}
+    return roles.get(digest, "a scene without a role in the table of scenes")
+
+
+def make(folder: Path, fixed: FixedScene) -> None:
+    """Generate a scene, unless its folder is there, and check its hashes.
+
+    Raises:
+        SceneError: If it is absent and made by hand, or other than in the table.
+    """
+    if not folder.exists():
+        if fixed.synth is None:
+            raise SceneError(folder, expected="this scene", found="nothing there", todo=fixed.made)
+        generate(folder, SynthSettings(**fixed.synth))
+    scene = read_scene(folder)
+    found = (scene_hash(scene), split_hash(scene))
+    if found != (fixed.scene_hash, fixed.split_hash):
+        raise SceneError(
+            folder,
+            expected=f"scene {fixed.scene_hash[:10]}, split {fixed.split_hash[:10]}",
+            found=f"scene {found[0][:10]}, split {found[1][:10]}",
+            todo="make it again in another folder; if it differs again, this version of open3d or "
+            "this platform draws other pixels: do not compare its results with those of the table",
+        )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make and check scenes; return 1 if one could not be made or differs."""
+    known = fixed_scenes()
+    parser = argparse.ArgumentParser(prog="python -m leaderboard.scenes", description="Make scenes")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(known))
+    parser.add_argument("--role", choices=ROLES)
+    given = parser.parse_args(arguments)
+    generated = [n for n, s in known.items() if s.synth and given.role in (None, s.role)]
+    failed = 0
+    for name in given.names or generated:
+        try:
+            make(given.folder / name, known[check_choice("NAME", name, known)])
+            print(f"{given.folder / name}: {ROLES[known[name].role]}; hashes agree", flush=True)
+        except ChronoSceneError as error:
+            failed = 1
+            print(f"error: {error}", file=sys.stderr, flush=True)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

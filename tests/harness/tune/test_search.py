@@ -1,0 +1,149 @@
+"""Searches: repeatable, resumable, and blind to test views."""
+
+import csv
+import shutil
+import sys
+import tomllib
+from dataclasses import replace
+
+import pytest
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import read_run
+from chronoscene.harness.plan.settings import bench_settings
+from chronoscene.harness.tune.report import best_of
+from chronoscene.harness.tune.search import tune
+from chronoscene.methods import build_config, load_spec
+
+from ..conftest import execute_here
+
+pytest.importorskip("optuna")
+
+
+@pytest.fixture
+def search(scene_folder, tmp_path, monkeypatch):
+    """Search in this process; returns the results."""
+    monkeypatch.setattr("chronoscene.harness.train.worker.warm_up", lambda *args, **options: None)
+
+    def run(out, trials=3, *, execute=execute_here, method="toy_methods:TUNED", **changes):
+        fields = {"scenes": (scene_folder,), "methods": (method,), "runs": tmp_path / out}
+        fields |= {"threads": 1, **changes}
+        return tune(bench_settings(**fields), trials, lambda line: None, execute=execute)
+
+    return run
+
+
+def untimed(results):
+    return [replace(result, seconds=0.0) for result in results]
+
+
+def broken_copy(scene, folder):
+    """The scene with test photos that nobody can decode."""
+    shutil.copytree(scene, folder)
+    for name in ("a/2.png", "b/1.png", "b/2.png"):
+        (folder / "images" / name).write_bytes(b"no image")
+    return folder
+
+
+def test_equal_seeds_give_equal_trials_whatever_the_test_photos(search, scene_folder, tmp_path):
+    first = search("first", 5)
+    assert untimed(search("again", 5)) == untimed(first)
+    blind = broken_copy(scene_folder, tmp_path / "broken/ring")
+    assert untimed(search("blind", 5, scenes=(blind,))) == untimed(first)
+    assert len({str(result.options) for result in first}) == 5
+    other = search("other", 5, seeds=(1,))
+    assert [r.options for r in other][1:] != [r.options for r in first][1:]
+
+
+def test_a_method_of_the_package(search):
+    options = {"method": "3dgs", "preset": "fast", "iterations": 4}
+    first = search("first", **options)
+    assert untimed(search("again", **options)) == untimed(first)
+    assert [r.number for r in first if r.psnr is not None] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("failing", [1, 2, 4])
+def test_an_interrupted_search_goes_on_where_it_was(search, failing):
+    """Before, and after, the run of a trial has its result."""
+    whole = search("whole", 14)
+    for after in (False, True):
+        calls, out = [], f"interrupted-{after}"
+
+        def interrupted(job, calls=calls, after=after):
+            calls.append(job)
+            failure = execute_here(job) if after or len(calls) != failing else None
+            if len(calls) == failing:
+                raise KeyboardInterrupt
+            return failure
+
+        with pytest.raises(KeyboardInterrupt):
+            search(out, 14, execute=interrupted)
+        search(out, 12)
+        assert untimed(search(out, 14)) == untimed(whole)
+
+
+def test_the_first_trial_is_the_preset_and_the_best_one_becomes_a_preset(
+    search, bench_here, tmp_path
+):
+    results = search("out", 4)
+    spec = load_spec("toy_methods:TUNED")
+    start = build_config(spec, preset="balanced")
+    assert results[0].options == {name: getattr(start, name) for name in spec.search}
+    best, path = best_of(results), tmp_path / "out/preset.toml"
+    assert best.psnr == max(result.psnr for result in results)
+    written = tomllib.loads(path.read_text())
+    assert written["base"] == "balanced" and written["method"] == "tuned"
+    assert written["options"] == {
+        name: value for name, value in best.options.items() if value != getattr(start, name)
+    }
+    tuning = written["tuning"]
+    assert tuning["trials"] == 4 and tuning["failed"] == 0 and tuning["best_trial"] == best.number
+    assert [scene["name"] for scene in tuning["scenes"]] == ["ring"]
+
+    (folder,) = bench_here("toy_methods:TUNED", preset=str(path), validation=True)[0].finished
+    assert folder.parent.name == "tuned-joint-preset-validation=true"
+    assert read_run(folder).aggregates["macro"]["psnr"] == best.psnr
+    (again,) = bench_here("toy_methods:TUNED", preset=str(path), validation=True)[0].finished
+    assert again == folder
+
+    rows = list(csv.DictReader((tmp_path / "out/trials.csv").open()))
+    assert [float(row["psnr"]) for row in rows] == [result.psnr for result in results]
+    kept = {p.name for p in (tmp_path / "out/trials").rglob("*") if p.is_file()}
+    assert {"run.json", "results.json"} <= kept and not any("png" in name for name in kept)
+
+
+def test_failed_trials_count(search):
+    def failing(job):
+        return job.failure("too bad") if "001" in str(job.folder) else execute_here(job)
+
+    results = search("out", execute=failing)
+    assert [result.failure for result in results] == ["", "too bad", ""]
+    assert results[1].psnr is None and best_of(results) is not results[1]
+    assert search("out") == results
+    with pytest.raises(ConfigError, match=r"expected a trial with a result, found none.*too bad"):
+        search("none", 2, execute=lambda job: job.failure("too bad"))
+
+
+def test_several_trials_at_a_time(search):
+    results = search("out", 3, execute=None, jobs=2)
+    assert [result.number for result in results] == [0, 1, 2]
+    assert not any(result.failure for result in results)
+
+
+def test_another_search_in_the_same_folder_is_refused(search, scene_folder, tmp_path):
+    search("out", 1)
+    for changes, found in (
+        ({"seeds": (1,)}, "a search with seed 1, found one with seed 0"),
+        ({"iterations": 7}, "a search with iterations 7, found one with iterations 20"),
+        ({"method": "3dgs"}, "a search with method 3dgs, found one with method tuned"),
+    ):
+        with pytest.raises(ConfigError, match=found):
+            search("out", 2, **changes)
+
+
+def test_what_is_missing_is_said(search, monkeypatch):
+    with pytest.raises(ConfigError, match="a method with a search space, found none"):
+        search("out", method="toy_methods:MEAN")
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ConfigError, match=r"the package optuna.*install 'chronoscene"):
+        search("out")
