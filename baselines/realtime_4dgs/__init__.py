@@ -41,6 +41,6 @@ SPEC = MethodSpec(
         **SEARCH,
         "time_lr": Range(1.6e-4, 0.02),
         "wave_dc_lr": Range(1e-4, 0.01),
-        "wave_cycle": (1.0, 2.0),
+        "initial_time_scale": Range(0.2, 1.0),
     },
 )
