@@ -32,7 +32,7 @@ STEPS = 3
 EPS = 1e-4
 """Of Adam, where trainings are compared."""
 LOSS_TOLERANCE = {"cpu": 1e-6, "cuda": 1e-4}
-"""Of the losses, relatively. Measured on a CPU: 1.2e-7. On a GPU not yet measured, nor are these:"""
+"""Of the losses, relatively. Measured on a CPU: 1.2e-7. Not measured on a GPU, nor are these:"""
 IMAGE_TOLERANCE = {"cpu": 2e-6, "cuda": 1e-3}
 """Of images after `STEPS`. Measured on a CPU: 2e-7."""
 RENDER_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}
