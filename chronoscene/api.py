@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ChronoSceneError, SceneError
-from chronoscene.formats import read_scene
+from chronoscene.formats import find_scenes, read_scene
 from chronoscene.harness.files.records import ROWS_FILE, Failure, read_with_rows
 from chronoscene.harness.plan.settings import BenchSettings, RunSettings
 from chronoscene.harness.plan.stop import parse_duration
@@ -222,7 +223,7 @@ def bench(
     trained in a process of its own.
 
     Args:
-        scenes: Folders of scenes, or one of them.
+        scenes: Folders of scenes, or of folders that have scenes in them; or one of them.
         methods: Names, or ``module:SPEC``.
         out: Folder of runs.
         preset: Preset of the methods, or the path of a preset file.
@@ -262,8 +263,10 @@ def bench(
         device=device,
         period_by=period_by,
     )
+    folders = map(Path, [scenes] if isinstance(scenes, str | Path) else scenes)
+    found = (find_scenes(folder, format=format, period_by=period_by) for folder in folders)
     settings = BenchSettings(
-        scenes=tuple(map(Path, [scenes] if isinstance(scenes, str | Path) else scenes)),
+        scenes=tuple(chain.from_iterable(found)),
         methods=_several(methods),
         run=run,
         strategies=_several(strategies),

@@ -36,6 +36,8 @@ def reading_options(scene: str) -> Callable[[Any], Any]:
 
 RUNS = click.argument("folders", metavar="RUNS...", nargs=-1, required=True, type=EXISTING_FOLDER)
 
+SCENES = click.argument("scenes", metavar="[DIR]...", nargs=-1, type=FOLDER)
+
 LPIPS_WEIGHTS = click.option(
     "--lpips-weights",
     type=click.Path(path_type=Path, exists=True),

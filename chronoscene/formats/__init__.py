@@ -247,18 +247,42 @@ def find_scenes(
     Raises:
         SceneError: If there is no scene; lists what was looked for.
     """
+    if found := _scenes_of(path, format, period_by):
+        return found
+    if format is None:
+        detect(path, period_by=period_by)
+    return [path]
 
+
+def nearby_scenes(*, format: str | None = None, period_by: str | None = None) -> Path:
+    """Return the current folder if it is a scene or has scenes in it, else ``data/`` in it.
+
+    Raises:
+        SceneError: If neither has a scene.
+    """
+    here = Path.cwd()
+    for folder in (here, here / "data"):
+        if _scenes_of(folder, format, period_by):
+            return folder
+    raise SceneError(
+        here,
+        expected="a scene, or scenes in this folder or in data/",
+        found="none",
+        todo="give the folder of a scene; chronoscene synth makes one, download fetches published "
+        "ones",
+    )
+
+
+def _scenes_of(path: Path, format: str | None, period_by: str | None) -> list[Path]:
     def is_scene(folder: Path) -> bool:
         found = match_format(folder, period_by=period_by)
         return found is not None and format in (None, found.name, *found.others)
 
-    if path.is_dir() and not is_scene(path):
-        inside = sorted(child for child in path.iterdir() if child.is_dir() and is_scene(child))
-        if inside:
-            return inside
-    if format is None:
-        detect(path, period_by=period_by)
-    return [path]
+    if not path.is_dir():
+        return []
+    if is_scene(path):
+        return [path]
+    return sorted(child for child in path.iterdir() if child.is_dir() and is_scene(child))
 
 
 def read_scene(

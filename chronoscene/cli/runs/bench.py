@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from chronoscene.cli.options import (
-    FOLDER,
     LPIPS_WEIGHTS,
     RUNS_OUT,
+    SCENES,
     look_here_for,
     parse_assignments,
     reading_options,
@@ -19,6 +20,7 @@ from chronoscene.cli.options import (
 )
 from chronoscene.cli.output import check_place
 from chronoscene.cli.report.results import print_runs
+from chronoscene.formats import find_scenes, nearby_scenes
 from chronoscene.harness.files.records import read_failures
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.settings import (
@@ -37,7 +39,7 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 
 
 @click.command("bench")
-@click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
+@SCENES
 @click.option(
     "--method", "methods", required=True, help="Methods to run, as NAME[,NAME...] or module:SPEC."
 )
@@ -114,6 +116,7 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 def command(methods: str, strategies: str, seeds: int, seed: int, **options: Any) -> None:
     """Train, render and score methods on scenes.
 
+    DIR is a scene or a folder of scenes; without one, the current folder is searched, then data/.
     Each run (one method, strategy, scene and seed) gets a folder below --out with its checkpoint,
     predictions and scores. Finished runs are kept, so the same command resumes after an
     interruption. docs/guides/benchmark.md describes strategies, budget and seeds.
@@ -146,11 +149,12 @@ def settings_from(
 
     Raises:
         ConfigError: If one of them is wrong.
+        SceneError: If a folder has no scene.
     """
-    check_outside(out, scenes, option="--out")
-    check_place("--out", out)
-    return bench_settings(
-        scenes,
+    reading = {"format": options["dataset_format"], "period_by": options["period_by"]}
+    folders = scenes or (nearby_scenes(**reading),)
+    settings = bench_settings(
+        folders,
         methods,
         out,
         overrides=parse_assignments(assignments),
@@ -160,6 +164,10 @@ def settings_from(
         photo_disk=round(photo_disk * 1e9),
         **options,
     )
+    scenes = tuple(scene for folder in folders for scene in find_scenes(folder, **reading))
+    check_outside(out, scenes, option="--out")
+    check_place("--out", out)
+    return replace(settings, scenes=scenes)
 
 
 def report(outcome: BenchOutcome, out: Path) -> None:

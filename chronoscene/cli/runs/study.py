@@ -7,9 +7,9 @@ from typing import Any
 import click
 
 from chronoscene.cli.options import (
-    FOLDER,
     LPIPS_WEIGHTS,
     RUNS_OUT,
+    SCENES,
     look_here_for,
     reading_options,
     training_options,
@@ -24,7 +24,7 @@ ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 
 @click.command("study")
 @click.argument("name", metavar="NAME|FILE.toml")
-@click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
+@SCENES
 @reading_options("the scenes")
 @training_options
 @LPIPS_WEIGHTS

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import FOLDER, add_options, look_here_for, reading_options
+from chronoscene.cli.options import FOLDER, SCENES, add_options, look_here_for, reading_options
 from chronoscene.cli.output import emit, report_written, terminal_width
 from chronoscene.cli.runs.bench import settings_from
 from chronoscene.harness.files.strategies import STRATEGIES
@@ -18,7 +18,7 @@ from chronoscene.io.tables import boxed_text
 
 @click.command("tune")
 @click.argument("method")
-@click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
+@SCENES
 @click.option(
     "--trials",
     type=click.IntRange(min=1),

@@ -23,7 +23,7 @@ from chronoscene.cli.output import (
 )
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats import detect, find_scenes, read_scene
+from chronoscene.formats import detect, find_scenes, nearby_scenes, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import printable
@@ -73,7 +73,7 @@ class StatsRequest:
 
 
 @click.command("stats")
-@click.argument("folders", nargs=-1, required=True, type=PATH, metavar="DIR...")
+@click.argument("folders", nargs=-1, type=PATH, metavar="[DIR]...")
 @click.option(
     "--layout",
     type=click.Choice(["full", "paper"]),
@@ -119,9 +119,9 @@ def command(
 ) -> None:
     """Print the contents of scenes, by period.
 
-    DIR is a scene or a folder of scenes. The table has images, points, tracks, error, overlap and
-    coverage; docs/guides/statistics.md defines them. Periods are numbered from 0; "-" means that
-    there is nothing to measure.
+    DIR is a scene or a folder of scenes; without one, the current folder is searched, then data/.
+    The table has images, points, tracks, error, overlap and coverage; docs/guides/statistics.md
+    defines them. Periods are numbered from 0; "-" means that there is nothing to measure.
 
     All periods of a scene share one point cloud, and the paper does not say how its table splits
     it. Here, each point is counted once, in the period with the most observations of it, the
@@ -131,6 +131,8 @@ def command(
     were read, 1 if some were, 2 if none was or the command is used wrongly.
     """
     request = StatsRequest(**options)  # type: ignore[arg-type]
+    reading = {"format": request.dataset_format, "period_by": request.period_by}
+    folders = folders or (nearby_scenes(**reading),)
     paths = [p for f in folders for p in in_paper_order(_scenes(f, request))]
     _check_places(request, out, paths)
     items = list(zip(paths, _file_names(paths), strict=True))

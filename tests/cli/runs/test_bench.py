@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import chronoscene.cli.runs.bench as bench_module
 from chronoscene.cli import cli
-from chronoscene.errors import BackendError, ConfigError
+from chronoscene.errors import BackendError, ConfigError, SceneError
 from chronoscene.harness.files.records import Failure
 from chronoscene.harness.run.runner import BenchOutcome
 
@@ -109,6 +109,27 @@ def settings(monkeypatch):
     return invoke
 
 
+def test_scenes_in_folders_and_nearby(make_scene_folder, tmp_path, settings, monkeypatch):
+    scenes = tuple(make_scene_folder(name=f"data/{name}") for name in ("one", "two"))
+    for given in (scenes, [tmp_path / "data"]):
+        assert settings(*map(str, given), "--method", "3dgs").scenes == scenes
+    for here in (tmp_path, tmp_path / "data"):
+        monkeypatch.chdir(here)
+        assert settings("--method", "3dgs").scenes == scenes
+    monkeypatch.chdir(scenes[0])
+    assert settings("--method", "3dgs", "--out", str(tmp_path / "r")).scenes == scenes[:1]
+
+
+@pytest.mark.parametrize("command", [["bench", "--method", "3dgs"], ["stats"]])
+def test_no_scene_nearby(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(cli, command)
+    assert isinstance(result.exception, SceneError)
+    assert "expected a scene, or scenes in this folder or in data/, found none" in str(
+        result.exception
+    )
+
+
 def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
     make_scene_folder, tmp_path, monkeypatch, set_gsplat
 ):
@@ -136,9 +157,10 @@ def test_help_does_not_promise_equal_models_of_budgets(option):
     assert "qual seeds" in found[option] and "not" in found[option]
 
 
-def test_defaults(settings):
-    asked = settings("a", "--method", "chronogs")
-    assert asked.scenes == (Path("a"),) and asked.methods == ("chronogs",)
+def test_defaults(settings, make_scene_folder):
+    scene = make_scene_folder()
+    asked = settings(str(scene), "--method", "chronogs")
+    assert asked.scenes == (scene,) and asked.methods == ("chronogs",)
     assert asked.strategies == ("joint",) and asked.run.preset == "balanced"
     assert asked.seeds == (0,) and asked.run.runs == Path("runs") and asked.run.max_width == 1600
     assert (
@@ -150,9 +172,10 @@ def test_defaults(settings):
     assert (asked.jobs, asked.job_memory, asked.ray) == (None, None, None)
 
 
-def test_devices_of_a_cluster_are_not_looked_for_here(settings, monkeypatch):
+def test_devices_of_a_cluster_are_not_looked_for_here(settings, make_scene_folder, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    asked = settings("a", "--method", "3dgs", "--device", "cuda", "--ray", "auto")
+    scene = str(make_scene_folder())
+    asked = settings(scene, "--method", "3dgs", "--device", "cuda", "--ray", "auto")
     assert (asked.ray, asked.run.device) == ("auto", "cuda")
 
 
@@ -186,10 +209,12 @@ def test_every_option_arrives(settings, tmp_path):
         (["--method", "a,,b"], "--method: expected names separated by commas"),
     ],
 )
-def test_wrong_options_are_told(arguments, message):
+def test_wrong_options_are_told(make_scene_folder, arguments, message):
     with pytest.raises(ConfigError, match=message):
         CliRunner().invoke(
-            cli, ["bench", "a", "--method", "chronogs", *arguments], catch_exceptions=False
+            cli,
+            ["bench", str(make_scene_folder()), "--method", "chronogs", *arguments],
+            catch_exceptions=False,
         )
 
 
@@ -200,12 +225,12 @@ def test_unknown_methods_name_the_known_ones(make_scene_folder):
     assert "did you mean 'chronogs'" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_a_failed_bench_has_status_1(monkeypatch):
+def test_a_failed_bench_has_status_1(make_scene_folder, monkeypatch):
     failure = Failure(
         method="m", strategy="joint", preset="fast", scene="s", seed=0, reason="because"
     )
     monkeypatch.setattr(bench_module, "run_bench", lambda *a: BenchOutcome((), 0, (failure,)))
     monkeypatch.setattr(bench_module, "read_failures", lambda runs: [failure])
-    result = CliRunner().invoke(cli, ["bench", "a", "--method", "m"])
+    result = CliRunner().invoke(cli, ["bench", str(make_scene_folder()), "--method", "m"])
     assert result.exit_code == 1
     assert "failed: s, m: because" in result.output

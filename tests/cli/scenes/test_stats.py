@@ -34,6 +34,16 @@ def test_a_scene(make_scene_folder):
     assert points_0 + points_1 == 30
 
 
+def test_without_a_folder_the_current_one_or_data(make_scene_folder, tmp_path, monkeypatch):
+    make_scene_folder(name="data/place")
+    results = []
+    for here in (tmp_path, tmp_path / "data", tmp_path / "data" / "place"):
+        monkeypatch.chdir(here)
+        results.append(run("--layout", "paper", "--format", "csv"))
+    assert {result.exit_code for result in results} == {0}
+    assert len({result.stdout for result in results}) == 1 and "place" in results[0].stdout
+
+
 def test_a_folder_of_scenes_and_several_folders(make_scene_folder, tmp_path):
     make_scene_folder(name="set/b")
     make_scene_folder({"1.png": 0, "2.png": 1, "3.png": 2}, name="set/a")
