@@ -163,7 +163,9 @@ def workers():
     return found
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
+)
 def test_runs_end_with_their_bench(number, on_ray, cluster, scene_folder, tmp_path):
     runs, hold = tmp_path / "runs", cluster.hold
     hold.touch()
