@@ -6,8 +6,6 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from chronoscene.checks import check_choice
 from chronoscene.formats import detect, load_format, writable_formats
 from chronoscene.images.store import ImageSource, Progress
@@ -104,15 +102,9 @@ def obstacles(scene: Scene) -> list[str]:
             f"cameras have lens distortion ({', '.join(distorted)}), which is kept; methods need "
             "undistorted images: run chronoscene undistort"
         )
-    points = scene.points
-    if not len(points):
+    if not len(scene.points):
         found.append(
             "the scene has no points, and methods are initialised from points; triangulate some"
-        )
-    elif not np.diff(points.track_start).any():
-        found.append(
-            "no point is observed in an image, and methods are initialised from observed points "
-            "only; colmap point_triangulator triangulates points for known poses"
         )
     if not scene.select(split="train"):
         found.append(

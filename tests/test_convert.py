@@ -231,10 +231,6 @@ def test_obstacles(make_scene_folder):
     distortion, points, tests = obstacles(bad)
     assert "OPENCV" in distortion and "chronoscene undistort" in distortion
     assert "no points" in points and "chronoscene split" in tests
-    cloud = dataclasses.replace(
-        Points.empty(), ids=np.array([1]), xyz=np.zeros((1, 3)), track_start=np.zeros(2, np.int64)
-    )
-    assert "observed" in obstacles(dataclasses.replace(scene, points=cloud))[0]
 
 
 @pytest.mark.parametrize("source", ["copy", "link", "symlink"])

@@ -173,7 +173,13 @@ def _training_frames(scene: Scene, periods: range) -> tuple[Frame, ...]:
 
 
 def _seen(scene: Scene, periods: range) -> NDArray[np.bool_]:
-    """Return True where a training image of one of these periods sees the point. [P, T]"""
+    """Return True where a training image of one of these periods sees the point. [P, T]
+
+    Points of other sources than COLMAP, such as laser scans, have no tracks: if that is true of
+    all, they count as seen in every period.
+    """
+    if len(scene.points) and not scene.points.track_frame.size:
+        return np.ones((len(scene.points), scene.num_periods), bool)
     counts = [f.split == "train" and f.period in periods for f in scene.frames]
     return scene.point_periods(np.array(counts))
 

@@ -66,8 +66,6 @@ def _short_tracks(scene: RawScene, points: RawPoints, *, few: bool) -> Iterator[
     short = int(np.count_nonzero(lengths < 2))
     if few != (short <= MAX_SHORT * len(points)):
         return
-    if short and not lengths.any() and scene.tests is not None:
-        return  # no tracks at all: CS514
     for number, found in ((0, "no observation"), (1, "one observation")):
         expected = "two or more observations of each point"
         yield from _some_points(scene, points, lengths == number, expected, found)
@@ -147,17 +145,17 @@ def observation_not_finite(
 
 @rule.error(
     "CS514",
-    bad="points without tracks; points seen only in test images",
+    bad="points seen only in test images",
     remedy="triangulate points (colmap point_triangulator), or change the split",
 )
 def no_training_points(
     scene: RawScene, images: RawImages, observations: Observations, tests: set[str]
 ) -> Iterator[Hit]:
     """No point of the model is seen in a training image, but methods start from such points.
-    Benchmarks refuse the scene."""
+    Benchmarks refuse the scene, unless its points have no tracks at all: then they take all."""
     train = np.array([name not in tests for name in images.names], bool)
     total = len(scene.points or ())
-    if total and not train[observations.image[observations.valid]].any():
+    if observations.valid.any() and not train[observations.image[observations.valid]].any():
         yield Hit(scene.model_file("points3D"), "points seen in training images", f"0 of {total}")
 
 

@@ -264,6 +264,20 @@ def test_a_scene_without_points_is_refused(make_scene):
         parts_of(make_scene(points=Points.empty()), "joint")
 
 
+def test_points_without_any_track_are_taken_for_all_periods(make_scene):
+    scene = make_scene()
+    count = len(scene.points)
+    points = replace(
+        scene.points,
+        track_start=np.zeros(count + 1, np.int64),
+        track_frame=np.zeros(0, np.int32),
+        track_xy=np.zeros((0, 2)),
+    )
+    (part,) = parts_of(replace(scene, points=points), "joint")
+    assert part.train.point_periods.shape == (count, scene.num_periods)
+    assert part.train.point_periods.all()
+
+
 def test_methods_without_period_run_pooled_with_a_notice():
     blind, mean = load_spec("toy_methods:BLIND"), load_spec("toy_methods:MEAN")
     strategy, notice = effective_strategy(blind, "joint")

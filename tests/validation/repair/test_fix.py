@@ -199,7 +199,7 @@ def test_short_tracks_are_removed_with_their_points(scene, fix):
 def test_points_of_a_laser_scan_stay(scene, fix):
     scene.write(POINTS, [" ".join(line.split()[:8]) for line in scene.lines(POINTS)])
     fixed, after, out = fix()
-    assert "CS514" in after and fixed == set()
+    assert "CS503" in after and fixed == set()
     assert len(read_raw_model(out / "sparse/0").points) == 40
 
 

@@ -125,7 +125,7 @@ def test_scene_of_another_format(studio):
     assert (report.name, report.path) == ("studio", studio)
     assert report.summary.images == 18 and len(report.summary.periods) == 2
     # It has no tracks: that is what the format cannot say.
-    assert codes(report) == {"CS006", "CS507", "CS509", "CS514"}
+    assert codes(report) == {"CS006", "CS503", "CS507", "CS509"}
     said = next(f for f in report.findings if f.code == "CS006")
     assert said.found == "a scene in nerfstudio"
     assert sorted(studio.rglob("*")) == before
@@ -142,7 +142,7 @@ def test_masks_of_a_scene_of_another_format(scene, tmp_path):
 def test_faults_of_a_scene_of_another_format(studio):
     shutil.copy(studio / "images/a001.png", studio / "images/b002.png")
     found = {(f.code, f.place) for f in validate_scene(studio).findings if f.severity == "error"}
-    assert found == {("CS602", "images/a001.png"), ("CS514", "sparse/0/points3D.bin")}
+    assert found == {("CS602", "images/a001.png")}
 
 
 def test_what_is_left_out_of_another_format(studio):
