@@ -78,6 +78,21 @@ DEVICE = click.option(
     "--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="Device to render on."
 )
 
+
+def _plugins(_context: click.Context, _option: click.Parameter, value: str | None) -> Iterable[str]:
+    names = () if value is None else split_list("--plugin", value)
+    look_here_for(names)
+    return names
+
+
+PLUGIN = click.option(
+    "--plugin",
+    metavar="module:SPEC",
+    callback=_plugins,
+    help="Method that is not installed whose runs may be opened, or several, separated by commas. "
+    "Its code is executed.",
+)
+
 _TRAINING = {
     "preset": click.option(
         "--preset", default="balanced", help="Preset of the methods, or a file FILE.toml with one."

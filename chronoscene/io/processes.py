@@ -301,11 +301,27 @@ def _pooled(
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        try:
-            yield from pool.map(partial(_stoppably, function), items)
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    with _safe_path():
+        pool = ProcessPoolExecutor(workers, get_context("spawn"))
+        results = pool.map(partial(_stoppably, function), items)  # starts the processes
+    try:
+        yield from results
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Start processes as with -P: no file in the current folder shadows a module."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 def _stoppably(function: Callable[[Item], Result], item: Item) -> Result:

@@ -61,6 +61,18 @@ def test_a_process_that_dies_is_an_error_in_one_line():
         list(map_parallel(die_on_two, [1, 2, 3], workers=2))
 
 
+def test_a_file_in_the_current_folder_is_no_module(tmp_path):
+    """As ``cd DATASET && chronoscene validate .`` does it, with a dataset of somebody else."""
+    (tmp_path / "multiprocessing.py").write_text("open('executed', 'w')")
+    code = (
+        "import sys; sys.path.remove('')\n"
+        "from chronoscene.io.processes import map_parallel\n"
+        "assert list(map_parallel(abs, [1, -2], workers=2)) == [1, 2]"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+    assert not (tmp_path / "executed").exists()
+
+
 def test_a_request_to_end_cleans_up(tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as end, stoppable(), replacing(tmp_path / "a.txt") as partial:

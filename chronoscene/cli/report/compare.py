@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 from click.core import ParameterSource
 
-from chronoscene.cli.options import EXISTING_FOLDER, FILE, SCENE
+from chronoscene.cli.options import EXISTING_FOLDER, FILE, PLUGIN, SCENE
 from chronoscene.cli.output import (
     A_FILE,
     check_file,
@@ -62,6 +62,7 @@ from chronoscene.metrics.registry import metric_info
     "that is from the nearer one.",
 )
 @SCENE
+@PLUGIN
 def command(
     runs: Path,
     views: int,
@@ -71,6 +72,7 @@ def command(
     html: Path | None,
     periods: str | None,
     scene: Path | None,
+    plugin: tuple[str, ...],
 ) -> None:
     """Show where the methods of finished runs differ.
 
@@ -85,7 +87,7 @@ def command(
     check_file("--html", html)
     if periods is not None:
         _refuse_options()
-        compare_between(runs, periods, style, out, scene)
+        compare_between(runs, periods, style, out, scene, plugin)
         return
     name = metric_info(metric).name
     records, failures = read_runs([runs])
@@ -116,14 +118,19 @@ def _refuse_options() -> None:
 
 
 def compare_between(
-    runs: Path, periods: str, style: str, out: Path | None, root: Path | None
+    runs: Path,
+    periods: str,
+    style: str,
+    out: Path | None,
+    root: Path | None,
+    plugin: tuple[str, ...],
 ) -> None:
     """Render and score the methods of all scenes between two periods; draw a figure of each."""
     records, _ = read_runs([runs])
     found = []
     with progress_bar() as bar:
         for name, chosen in by_scene(records).items():
-            opened = [open_run(record.folder) for record in chosen]
+            opened = [open_run(record.folder, plugin=plugin) for record in chosen]
             dates = parse_dates(opened[0], periods)
             views = chosen_views(ground_truth_folder(runs, name), 1)
             if not (own := [v.view for v in views if v.camera_period in dates]):

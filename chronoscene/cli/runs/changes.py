@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from chronoscene.cli.options import DEVICE, PATH, RUN, SCENE
+from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE
 from chronoscene.cli.output import emit, report_written, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -43,9 +43,15 @@ _ALL_PAIRS = 4  # Periods of which all pairs are compared unless the user choose
     f"up to {_ALL_PAIRS} periods; of more, each with the next]",
 )
 @SCENE
+@PLUGIN
 @DEVICE
 def command(
-    folder: Path, out: Path, between: tuple[tuple[str, str], ...], scene: Path | None, device: str
+    folder: Path,
+    out: Path,
+    between: tuple[tuple[str, str], ...],
+    scene: Path | None,
+    device: str,
+    plugin: tuple[str, ...],
 ) -> None:
     """Map what changes between the periods of a finished run.
 
@@ -54,7 +60,7 @@ def command(
     with them and compared with differences of images. docs/guides/changes.md explains the
     scores.
     """
-    run = open_run(folder, device=device)
+    run = open_run(folder, device=device, plugin=plugin)
     pairs = [_pair(run, *names) for names in between]
     pairs = pairs or usual_pairs(run.num_periods)
     if not pairs:

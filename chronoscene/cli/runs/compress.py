@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, RUN, SCENE
+from chronoscene.cli.options import DEVICE, PLUGIN, RUN, SCENE
 from chronoscene.cli.output import emit, report_written
 from chronoscene.cli.progress import announce
 from chronoscene.harness.files.records import read_run
@@ -24,14 +24,22 @@ from chronoscene.harness.use.trained_run import open_run
 )
 @click.option("--plain", is_flag=True, help="Use half floats and LZMA only.")
 @SCENE
+@PLUGIN
 @DEVICE
-def command(folder: Path, max_loss: float, plain: bool, scene: Path | None, device: str) -> None:
+def command(
+    folder: Path,
+    max_loss: float,
+    plain: bool,
+    scene: Path | None,
+    device: str,
+    plugin: tuple[str, ...],
+) -> None:
     """Compress the model of a finished run.
 
     RUN is the folder of the run, such as runs/plaza/chronogs-joint-balanced/seed0. The compressed
     model becomes a run beside it, with its own scores and its own row in chronoscene table.
     """
-    run = open_run(folder, device=device)
+    run = open_run(folder, device=device, plugin=plugin)
     announce("read the scene")
     out = compress_run(run, run.scene(scene), max_loss=None if plain else max_loss, log=announce)
     before, after = run.record, read_run(out)

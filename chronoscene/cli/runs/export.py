@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, FILE, RUN, SCENE, STAGE
+from chronoscene.cli.options import DEVICE, FILE, PLUGIN, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, emit, report_written
 from chronoscene.cli.progress import announce
 from chronoscene.formats.shared.gaussian_ply import write_gaussians
@@ -22,9 +22,16 @@ from chronoscene.io.wording import counted
 @click.option("--out", type=FILE, required=True, help="PLY file to write.")
 @SCENE
 @STAGE
+@PLUGIN
 @DEVICE
 def command(
-    folder: Path, period: str, out: Path, scene: Path | None, stage: int | None, device: str
+    folder: Path,
+    period: str,
+    out: Path,
+    scene: Path | None,
+    stage: int | None,
+    device: str,
+    plugin: tuple[str, ...],
 ) -> None:
     """Export a period of a finished run as Gaussians.
 
@@ -32,7 +39,7 @@ def command(
     PLY file as 3DGS writes it, in the world frame of the scene. What depends on the direction of
     view is fitted to the training views; the PSNR that this costs on the test views is printed.
     """
-    run = open_run(folder, device=device, stage=stage)
+    run = open_run(folder, device=device, plugin=plugin, stage=stage)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
     check_file("--out", out)
     wanted = run.parse_period(period)

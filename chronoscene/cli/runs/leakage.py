@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, EXISTING_FOLDER, RUN, SCENE
+from chronoscene.cli.options import DEVICE, EXISTING_FOLDER, PLUGIN, RUN, SCENE
 from chronoscene.cli.output import OUT_FILE, check_file, emit, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -33,9 +33,16 @@ from chronoscene.io import tables
 )
 @OUT_FILE
 @SCENE
+@PLUGIN
 @DEVICE
 def command(
-    folder: Path, truth: Path | None, style: str, out: Path | None, scene: Path | None, device: str
+    folder: Path,
+    truth: Path | None,
+    style: str,
+    out: Path | None,
+    scene: Path | None,
+    device: str,
+    plugin: tuple[str, ...],
 ) -> None:
     """Measure what leaks between the periods of a run.
 
@@ -44,7 +51,7 @@ def command(
     docs/reference/scores.md defines the columns.
     """
     check_file("--out", out)
-    run = open_run(folder, device=device)
+    run = open_run(folder, device=device, plugin=plugin)
     found = run.scene(scene)
     place = truth or found.root / "gt"
     tests = len(found.select(split="test"))

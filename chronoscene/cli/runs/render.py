@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, PATH, RUN, SCENE, STAGE
+from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, check_place, report_written
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -57,6 +57,7 @@ from chronoscene.io.staging import check_outside
 )
 @SCENE
 @STAGE
+@PLUGIN
 @DEVICE
 def command(
     folder: Path,
@@ -69,13 +70,14 @@ def command(
     scene: Path | None,
     stage: int | None,
     device: str,
+    plugin: tuple[str, ...],
 ) -> None:
     """Render a finished run from any camera.
 
     RUN is the folder of the run, such as runs/plaza/chronogs-joint-balanced/seed0. An orbit circles
     the middle of the sparse points, at the height and distance of the cameras.
     """
-    run = open_run(folder, device=device, stage=stage)
+    run = open_run(folder, device=device, plugin=plugin, stage=stage)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
     if is_animation(out):
         check_file("--out", out)

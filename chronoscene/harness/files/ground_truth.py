@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from chronoscene.errors import ConfigError
-from chronoscene.harness.files.predictions import ImageWriter, Manifest, read_manifest, safe_name
+from chronoscene.harness.files.predictions import ImageWriter, Manifest, read_manifest, safe_part
 from chronoscene.harness.files.records import GROUND_TRUTH
 from chronoscene.images.store import ImageStore
 from chronoscene.io.staging import needing_space, partial_name
@@ -16,7 +16,7 @@ from chronoscene.scene import Scene
 
 def ground_truth_folder(runs: Path, scene: str) -> Path:
     """Return the folder of the ground truth of a scene."""
-    return runs / GROUND_TRUTH / safe_name(scene)
+    return runs / GROUND_TRUTH / safe_part(scene)
 
 
 def freeze_ground_truth(

@@ -69,6 +69,11 @@ def safe_name(name: str) -> str:
     return _UNSAFE.sub(lambda match: f"%{ord(match.group()):02X}", name)
 
 
+def safe_part(name: str) -> str:
+    """Make a name one part of a path, as `safe_name` does: no folder, and none above."""
+    return safe_name(name).replace("/", "%2F") if name.strip(".") else name.replace(".", "%2E")
+
+
 def image_file(view: str) -> str:
     """Return the path of a view's image below its folder.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from chronoscene.harness.files.predictions import safe_name
+from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.provenance import config_hash
 from chronoscene.harness.files.records import SOURCE_FILE, Failure
 from chronoscene.harness.files.source import RunSource
@@ -78,8 +78,8 @@ class Job:
         name = "-".join(filter(None, (*self._names, self.variant)))
         if len(name) > LONGEST_NAME:
             name = f"{name[:LONGEST_NAME]}-{config_hash({'variant': self.variant})[:8]}"
-        folder = safe_name(name).replace("/", "%2F")
-        return self.settings.runs / safe_name(self.scene) / folder / f"seed{self.seed}"
+        folder = safe_part(name)
+        return self.settings.runs / safe_part(self.scene) / folder / f"seed{self.seed}"
 
     @property
     def _names(self) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from textwrap import shorten
 from typing import Any
 
 from chronoscene.figures import canvas
-from chronoscene.harness.files.predictions import safe_name
+from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.records import FIGURES
 from chronoscene.harness.report.comparison_figure import CELL_WIDTH
 from chronoscene.harness.report.tables import period_name
@@ -57,7 +57,7 @@ def draw_between(runs: Path, found: SceneBetween) -> Path:
         line[column].set_title(canvas.plain(head), fontsize=10)
     title = f"{found.scene}: {found.view} from period {first} to {last}"
     figure.suptitle(canvas.plain(title), fontsize=12)
-    path = runs / FIGURES / f"{safe_name(found.scene)}_between_{first}_{last}.png"
+    path = runs / FIGURES / f"{safe_part(found.scene)}_between_{first}_{last}.png"
     canvas.save(figure, path, bbox_inches="tight", pad_inches=0.1)
     return path
 

@@ -18,7 +18,7 @@ from chronoscene.harness.files.predictions import (
     load_image,
     load_mask,
     read_manifest,
-    safe_name,
+    safe_part,
 )
 from chronoscene.harness.files.records import FIGURES, PREDICTIONS, RunRecord
 from chronoscene.harness.report.summary import kind_of
@@ -56,7 +56,7 @@ def draw_figures(
         if not rows:  # trained on all photos
             continue
         for errors, name in ((False, "comparison"), (True, "errors")):
-            path = runs / FIGURES / f"{safe_name(scene)}_{name}.png"
+            path = runs / FIGURES / f"{safe_part(scene)}_{name}.png"
             _draw(path, scene, truth, rows, methods, labels, errors=errors)
             written.append(path)
     return written

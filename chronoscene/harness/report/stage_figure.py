@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.figures import canvas
-from chronoscene.harness.files.predictions import safe_name
+from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.records import FIGURES, RunRecord
 from chronoscene.harness.report.summary import kind_of
 from chronoscene.harness.report.tables import period_name
@@ -35,7 +35,7 @@ def draw_stages(runs: Path, records: Sequence[RunRecord]) -> list[Path]:
             rows.setdefault(title, []).append(record)
     written = []
     for scene, rows in scenes.items():
-        path = runs / FIGURES / f"{safe_name(scene)}_stages.png"
+        path = runs / FIGURES / f"{safe_part(scene)}_stages.png"
         _draw(path, scene, rows)
         written.append(path)
     return written

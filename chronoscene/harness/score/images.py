@@ -16,7 +16,7 @@ from chronoscene.errors import ConfigError, ImageError, SceneError
 from chronoscene.formats.shared.grouping import read_table
 from chronoscene.harness.files import records
 from chronoscene.harness.files.ground_truth import freeze_ground_truth, ground_truth_folder
-from chronoscene.harness.files.predictions import ImageWriter, safe_name
+from chronoscene.harness.files.predictions import ImageWriter, safe_part
 from chronoscene.harness.files.provenance import (
     code_version,
     config_hash,
@@ -187,7 +187,7 @@ def score_images(
             todo="choose the name that tables are to show",
         )
     method = re.sub(r"[^\w.+-]+", "-", name)
-    out = runs / safe_name(scene.name) / f"{method}-{STRATEGY}-{PRESET}" / f"seed{seed}"
+    out = runs / safe_part(scene.name) / f"{method}-{STRATEGY}-{PRESET}" / f"seed{seed}"
     if out.exists():
         raise ConfigError(
             out,

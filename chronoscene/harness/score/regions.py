@@ -23,7 +23,7 @@ from chronoscene.harness.files.predictions import (
     load_changed,
     load_mask,
     read_manifest,
-    safe_name,
+    safe_part,
     to_grey,
     write_manifest,
     write_png,
@@ -73,7 +73,7 @@ def freeze_change_masks(runs: Path, truth: Path) -> None:
         periods[record.scene] = [int(period) for period in record.period_labels]
     found = False
     for scene, ids in periods.items():
-        place = truth / safe_name(scene) / "gt"
+        place = truth / safe_part(scene) / "gt"
         if place.is_dir() or len(periods) == 1:
             found |= _freeze(
                 ground_truth_folder(runs, scene), place if place.is_dir() else truth, ids

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from chronoscene.harness.files.source import RunSource, read_bench_scene, read_s
 from chronoscene.harness.files.strategies import STRATEGIES, Strategy, period_part
 from chronoscene.harness.score.views import PredictedView, read_views
 from chronoscene.images.store import ImageStore
+from chronoscene.io.wording import quote
 from chronoscene.kernels.runtime import check_device
 from chronoscene.methods import (
     Method,
@@ -315,24 +315,26 @@ def open_run(
     folder: str | Path,
     *,
     device: str = "cpu",
-    plugin_path: Path | None = None,
+    plugin: str | Sequence[str] = (),
     stage: int | None = None,
 ) -> TrainedRun:
     """Open the folder of a finished run, ``RUNS/<scene>/<method>-<strategy>-<preset>/seed<k>``.
 
-    Models are loaded at their first use. The method of the run is imported, which executes its
-    code: open runs of people whom you trust.
+    Models are loaded at their first use. Nothing that the run brings is executed: its method is an
+    installed one, or one of ``plugin``.
 
     Args:
         folder: Folder with ``run.json``.
         device: ``cpu`` or ``cuda``.
-        plugin_path: Folder of the module of ``module:SPEC``, if it has moved.
+        plugin: ``module:SPEC`` of a method that is not installed, or several. They are imported,
+            which executes their code.
         stage: For a run under ``sequential``, the period after whose training the model was
             saved; None for the last.
 
     Raises:
         CheckpointError: If the folder has no finished run, or a file is damaged.
-        ConfigError: If the method is not installed, or there is no such stage.
+        ConfigError: If the method is neither installed nor in ``plugin``, or there is no such
+            stage.
         BackendError: If there is no such device.
     """
     check_device(device)
@@ -348,18 +350,7 @@ def open_run(
             todo="open a run that bench trained, with its checkpoint",
         )
     source = read_source(folder)
-    for path in filter(None, (plugin_path, source.plugin_path)):
-        if str(path) not in sys.path:
-            sys.path.append(str(path))
-    try:
-        spec = load_spec(source.method)
-    except ConfigError as error:
-        raise ConfigError(
-            source.method,
-            expected=f"the method of the run, from {source.plugin_path or record.method_version}",
-            found=error.found,
-            todo="install it, or put the folder of its module into PYTHONPATH",
-        ) from error
+    spec = _find_spec(record, source, [plugin] if isinstance(plugin, str) else plugin)
     if spec.runner is not None:
         raise CheckpointError(
             folder,
@@ -376,6 +367,30 @@ def open_run(
         training_from_world=Sim3.from_matrix(source.training_from_world),
         device=device,
         stage=stage,
+    )
+
+
+def _find_spec(record: RunRecord, source: RunSource, plugins: Sequence[str]) -> MethodSpec:
+    """Find the method of a run; never import a module because the run names it."""
+    if ":" not in source.method:
+        try:
+            return load_spec(source.method)
+        except ConfigError as error:
+            raise ConfigError(
+                quote(source.method),
+                expected=f"the method of the run, from {record.method_version}",
+                found=error.found,
+                todo="install it",
+            ) from error
+    for spec in map(load_spec, plugins):
+        if spec.name == record.method:
+            return spec
+    raise ConfigError(
+        quote(record.method),
+        expected=f"an installed method, or one of {', '.join(plugins) or '--plugin'}",
+        found=f"{quote(source.method)} from {quote(source.plugin_path or 'nowhere')}",
+        todo="if you have its code and trust it, add --plugin module:SPEC (in Python, plugin=), in "
+        "the folder of the module or with that in PYTHONPATH",
     )
 
 

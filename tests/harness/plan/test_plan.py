@@ -49,5 +49,5 @@ def test_periods_that_the_user_names_hold_for_the_whole_run(
     monkeypatch.chdir(tmp_path)
     outcome, _ = bench_here("toy_methods:MEAN", scenes=(folder,), period_by="table:periods.csv")
     monkeypatch.chdir("/")
-    (run,) = map(open_run, outcome.finished)
+    run = open_run(*outcome.finished, plugin="toy_methods:MEAN")
     assert [frame.period for frame in run.scene().frames] == [0, 0, 1, 1] * 2

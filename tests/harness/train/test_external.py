@@ -196,4 +196,4 @@ def test_settings_are_checked_before_anything_is_run(bench_here, name, changes, 
 def test_its_model_cannot_be_opened_here(bench_here):
     outcome, _ = bench_here("toy_programs:PROGRAM")
     with pytest.raises(CheckpointError, match="found one of Program, which is another program"):
-        open_run(outcome.finished[0])
+        open_run(outcome.finished[0], plugin="toy_programs:PROGRAM")

@@ -22,9 +22,9 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.spherical_harmonics import basis
 
 
-def export(folder, out, period):
+def export(folder, out, period, *options):
     """What the command prints: of the model and of the export, the PSNR on the test views."""
-    arguments = ["export", str(folder), "--period", str(period), "--out", str(out)]
+    arguments = ["export", str(folder), "--period", str(period), "--out", str(out), *options]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return [float(x) for x in re.findall(r"(-?[\d.]+) dB", result.stdout)]
@@ -111,8 +111,9 @@ def test_the_columns_are_those_of_3dgs(trained, tmp_path):
 
 
 def test_what_cannot_be_exported(runs, trained, scene_folder, tmp_path):
+    toy = ("--plugin", "toy_methods:MEAN")
     with pytest.raises(ConfigError, match=r"expected a method that gives.*found Mean"):
-        export(runs / "ring/mean-joint-balanced/seed0", tmp_path / "a.ply", 0)
+        export(runs / "ring/mean-joint-balanced/seed0", tmp_path / "a.ply", 0, *toy)
     with pytest.raises(ConfigError, match=r"period 0\.5: expected a whole number: 4DGS"):
         export(trained["4dgs"], tmp_path / "a.ply", 0.5)
     with pytest.raises(ConfigError, match="period 2: expected one from 0 to 1"):
