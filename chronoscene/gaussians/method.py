@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.errors import CheckpointError
+from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.model import SHAPES, GaussianModel, initialise, opacities_of, scales_of
 from chronoscene.gaussians.trainer import Due, GaussianTrainer
@@ -98,6 +98,13 @@ class GaussianMethod(SplattingMethod):
         return splats._replace(colors=self.model.splats(view, appearance_period).colors)
 
     def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        if type(self.model).splats is not GaussianModel.splats:
+            raise ConfigError(
+                self.name,
+                expected="static_gaussians beside splats, which draws more than at_period gives",
+                found="a method without it",
+                todo="write it as docs/guides/adding-a-method.md says, to export runs",
+            )
         p = self.model.at_period(period)
         sh_coeffs = torch.cat([p["sh_dc"][:, None], p["sh_rest"]], dim=1)
         scales, opacities = scales_of(p["log_scales"]), opacities_of(p["logit_opacities"])

@@ -8,7 +8,7 @@ import torch
 from toy_scene import HEIGHT, SHORT, WIDTH, mean_squared_error, toy_scene, train
 
 from baselines.gaussian_splatting.method import GaussianSplatting
-from chronoscene.errors import CheckpointError
+from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.gaussians.model import GaussianModel
@@ -90,6 +90,29 @@ class Painted(GaussianMethod):
 
     def learning_rates(self, due):
         return {**super().learning_rates(due), "added_color": 0.01}
+
+
+class DrawnModel(PaintedModel):
+    """The same, but for what it draws only."""
+
+    def at_period(self, period):
+        return self.parameters
+
+    def splats(self, view, period):
+        drawn = super().splats(view, period)
+        return drawn._replace(colors=drawn.colors + self.shared["added_color"][round(period)])
+
+
+class Drawn(Painted):
+    def make_model(self, parameters, train, seed):
+        painted = super().make_model(parameters, train, seed)
+        return DrawnModel(painted.parameters, painted.shared)
+
+
+def test_colours_that_an_export_would_lose_are_refused():
+    method = train(toy_scene(), replace(SHORT, iterations=3), method_class=Drawn)
+    with pytest.raises(ConfigError, match="painted: expected static_gaussians beside splats"):
+        method.to_gaussians(0.0, [])
 
 
 def test_a_field_needs_no_trainer_of_its_own(tmp_path):

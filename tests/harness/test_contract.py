@@ -47,6 +47,14 @@ def test_a_method_that_looks_at_test_photos_is_found(problems, monkeypatch, tmp_
     assert problems("PEEKING", rule) == [None]
 
 
+def test_gaussians_of_another_period_are_found(problems):
+    (problem,) = problems("LOSES_COLOURS", "gaussians_look_like_the_model")
+    assert problem.startswith(
+        "to_gaussians of periods 0 and 1: expected what changes in render, found 100% of"
+    )
+    assert problems("MEAN", "gaussians_look_like_the_model") == [None]
+
+
 class _Folder:
     def __init__(self, path):
         self.path = path

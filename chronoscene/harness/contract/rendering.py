@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.harness.contract.subject import NotApplicableError, Subject, demand, resized
+from chronoscene.harness.contract.tiny_training import periods_for
 from chronoscene.harness.train.checks import check_prediction
+from chronoscene.harness.train.painted_balls import VIEWS_PER_PERIOD
 from chronoscene.methods import Prediction, View
 
 
@@ -95,6 +99,36 @@ def fractional_periods_lie_between(subject: Subject) -> None:
     demand(change < 0.01, "render at period 0.0001", "nearly the image of period 0", change)
 
 
+BAKED = 0.02
+"""Largest mean error of exported Gaussians: twice that of scaffold-gs, whose opacities depend on
+the direction of view."""
+LOST = 0.9
+"""Largest part of what changes between periods that an export may lose: 0.7 of chronogs, which has
+hardly learned it in so few steps, and 1 of an export that is the same at all periods."""
+
+
+def gaussians_look_like_the_model(subject: Subject) -> None:
+    """Exported Gaussians look nearly like the model, and change with the period as it does."""
+    method, periods = subject.method, range(periods_for(subject.spec))
+    if not hasattr(method, "to_gaussians"):
+        raise NotApplicableError("the method gives no Gaussians")
+    views = subject.data.views[:VIEWS_PER_PERIOD]
+    errors, images = [], []
+    for period in periods:
+        own = [view for view in subject.data.views if view.period == period]
+        cloud = method.to_gaussians(float(period), own)
+        drawn = np.stack([method.render_gaussians(cloud, view).rgb for view in views[::3]])
+        images.append(np.stack([method.render(view, float(period)).rgb for view in views[::3]]))
+        errors.append(drawn - images[-1])
+        error = np.abs(errors[-1]).mean()
+        demand(error < BAKED, f"to_gaussians of period {period}", "the image of render", error)
+    for a, b in pairwise(periods):
+        change = np.abs(images[b] - images[a]).mean()
+        lost = np.abs(errors[b] - errors[a]).mean() / max(change, 1e-9)
+        place = f"to_gaussians of periods {a} and {b}"
+        demand(lost < LOST, place, "what changes in render", f"{lost:.0%} of it lost")
+
+
 def _image(subject: Subject, period: float) -> NDArray[np.float32]:
     return subject.method.render(subject.data.views[0], period).rgb
 
@@ -106,4 +140,5 @@ CHECKS = (
     a_view_of_nothing_is_background,
     periods_matter,
     fractional_periods_lie_between,
+    gaussians_look_like_the_model,
 )

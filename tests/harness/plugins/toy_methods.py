@@ -129,6 +129,16 @@ class Peeking(MeanColour):
         self.colors += sum(zlib.crc32(photo.read_bytes()) for photo in photos) % 1000 / 1e9
 
 
+class LosesColours(MeanColour):
+    """Its Gaussians are those of no period."""
+
+    def to_gaussians(self, period, views):
+        return self.colors[0]
+
+    def render_gaussians(self, gaussians, view):
+        return Prediction(np.full((view.height, view.width, 3), gaussians, np.float32))
+
+
 class Orphaned(MeanColour):
     """Kills what has started its process."""
 
@@ -176,5 +186,6 @@ NOT_FINITE = replace(
 BAD_IMAGE = spec("bad-image", BadImage)
 FULL_DISK = spec("full-disk", FullDisk)
 PEEKING = spec("peeking", Peeking)
+LOSES_COLOURS = spec("loses-colours", LosesColours)
 KILLED = spec("killed", Killed)
 ORPHANED = spec("orphaned", Orphaned)
