@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RunRecord, ViewScore
+from chronoscene.harness.report.comparable import KEY
 from chronoscene.harness.report.summary import COSTS
 from chronoscene.harness.score.regions import ALL
 from chronoscene.harness.score.scoring import aggregate
@@ -29,11 +30,6 @@ MAX_VALUE = 1e3
 """Largest absolute value of a metric."""
 MAX_COST = 1e15
 """Largest absolute value of any other number."""
-KEY = (
-    *("scene", "scene_hash", "split_hash", "method", "strategy", "preset", "variant"),
-    *("config_hash", "max_width", "device"),
-)
-"""Fields of `RunRecord` in which all runs of an entry agree."""
 
 _NAME = re.compile(r"\w[\w .,:+@()-]{0,99}")
 _HASH = re.compile(r"[0-9a-f]{64}")

@@ -14,6 +14,7 @@ from markupsafe import Markup
 from chronoscene.figures.canvas import period_colors
 from chronoscene.harness.files.command_line import command_line
 from chronoscene.harness.files.records import RunRecord
+from chronoscene.harness.report.comparable import Setting, comparable, setting_of
 from chronoscene.harness.report.published import PublishedTable
 from chronoscene.harness.report.summary import (
     PAPER_METRICS,
@@ -22,6 +23,7 @@ from chronoscene.harness.report.summary import (
     kind_of,
     metric_names,
     published_entries,
+    short_commits,
     summarise,
 )
 from chronoscene.harness.report.tables import period_title
@@ -31,7 +33,6 @@ from chronoscene.io.staging import staged_folder
 from chronoscene.methods import MethodSpec, installed_methods, load_spec
 from chronoscene.metrics.registry import metric_info
 from leaderboard.entries import MeasuredEntry
-from leaderboard.groups import Setting, comparable, setting_of
 from leaderboard.pareto import Point, plot
 from leaderboard.pictures import find_runs, gallery
 from leaderboard.scenes import role_of
@@ -108,8 +109,8 @@ class _Site:
             found = {run: r for run, r in pictured.items() if self.scene_of[r.scene] == scene}
             psnr = {run: r.aggregates["macro"].get("psnr", -math.inf) for run, r in found.items()}
             found = dict(sorted(found.items(), key=lambda item: -psnr[item[0]]))
-            views = [setting_of(r)[:-1] for r in found.values()]  # of one scene, split and width
-            found = {run: r for run, r in found.items() if setting_of(r)[:-1] == views[0]}
+            tests = [setting_of(r).test for r in found.values()]
+            found = {run: r for run, r in found.items() if setting_of(r).test == tests[0]}
             runs = {run: f"{r.title} ({kind_of(r)})" for run, r in found.items()}
             pictures = None
             if runs:
@@ -265,22 +266,30 @@ def _group(
     periods = sorted({i for run in runs for i in run.periods}, key=int)
     names = metric_names(runs)
     quality, *others = [name for name in PAPER_METRICS if name in names] or names
+    timed = part.quantity == "seconds"
+    devices = part.device[timed].unique()
+    part = part.assign(column=part.column.mask(timed, part.device))
+    times = [
+        ("seconds", device, COSTS["seconds"] + (f", {device}" if len(devices) > 1 else ""))
+        for device in devices
+    ]
     columns = [
         (quality, "macro", metric_info(quality).title),
         *((quality, f"period {i}", period_title(i, labels)) for i in periods),
         *((name, "macro", metric_info(name).title) for name in others),
-        *((name, "", title) for name, title in COSTS.items()),
+        *times,
+        *((name, "", title) for name, title in COSTS.items() if name != "seconds"),
     ]
     table = _table(columns, part, printed)
     legend = {i: (row["label"], colors[row["method"]]) for i, row in enumerate(table["rows"], 1)}
-    values = part[part.column.isin(("macro", ""))].set_index(["label", "quantity"])["mean"]
+    values = part.set_index(["label", "quantity", "column"])["mean"]
     plots = []
-    for name, cost in (("seconds", "training time [s]"), (SIZE, "size of the model [MB]")):
-        points = [
-            Point(i, float(in_unit(name, values[label, name])), values[label, quality])
-            for i, (label, _) in legend.items()
-            if {(label, name), (label, quality)} <= {*values.index}
-        ]
+    for name, column, cost in (*times, (SIZE, "", "size of the model [MB]")):
+        points = []
+        for i, (label, _) in legend.items():
+            spent, gained = (label, name, column), (label, quality, "macro")
+            if {spent, gained} <= {*values.index}:
+                points.append(Point(i, float(in_unit(name, values[spent])), values[gained]))
         plots.append(plot(points, legend, cost=cost, metric=quality))
     return {
         **table,
@@ -289,7 +298,7 @@ def _group(
         "legend": legend,
         "role": role_of(setting.scene_hash),
         "devices": list(dict.fromkeys(run.device for run in runs)),
-        "commits": list(dict.fromkeys(run.commit[:10] for run in runs)),
+        "commits": list(dict.fromkeys(short_commits(run.commit) for run in runs)),
     }
 
 

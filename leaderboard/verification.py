@@ -6,9 +6,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from chronoscene.errors import ConfigError
+from chronoscene.harness.report.comparable import KEY
 from chronoscene.harness.score.regions import ALL
 from chronoscene.harness.score.verification import Verified
-from leaderboard.entries import KEY, EntryRun, read_entry
+from leaderboard.entries import EntryRun, read_entry
 
 
 def verify_entries(folder: Path, runs: Iterable[Verified]) -> Iterator[Verified]:

@@ -86,7 +86,8 @@ def write_scored(
             pixels = rng.integers(0, 256, (6, 8, 3), dtype=np.uint8)
             period = row.camera_period
             writer.add(row.view, pixels, camera_period=period, rendered_period=period)
-        writer.close(kind=kind, scene=run.scene, scene_hash=hashes["scene_hash"], details={})
+        details = {"max_width": run.max_width}
+        writer.close(kind=kind, scene=run.scene, scene_hash=hashes["scene_hash"], details=details)
     write_run(folder, run, run.rows)
     return folder
 

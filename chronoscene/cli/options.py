@@ -156,16 +156,22 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
     """Parse ``KEY=VALUE`` texts.
 
     Raises:
-        ConfigError: If one has no ``=``.
+        ConfigError: If one has no ``=``, or a key is there twice.
     """
-    parsed = {}
+    parsed: dict[str, str] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
-        if not equals or not key.strip():
+        key, value = key.strip(), value.strip()
+        if not equals or not key:
             raise ConfigError(
                 "--set", expected="KEY=VALUE", found=repr(text), todo="write KEY=VALUE"
             )
-        parsed[key.strip()] = value.strip()
+        if key in parsed:
+            found = f"{parsed[key]} and {value}"
+            raise ConfigError(
+                f"--set {key}", expected="one value", found=found, todo="leave one out"
+            )
+        parsed[key] = value
     return parsed
 
 

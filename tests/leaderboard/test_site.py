@@ -158,6 +158,17 @@ def test_pages_say_what_is_of_older_code_and_the_role_of_a_scene(make_run, tmp_p
     assert "<h1>3DGS</h1>" in (tmp_path / "site/method/3dgs.html").read_text(encoding="utf-8")
 
 
+def test_times_of_devices_have_columns_of_their_own(make_run, tmp_path):
+    commit = "1" * 40 + "-dirty"
+    submit([make_run(seconds=7.0, commit=commit)], tmp_path / "e")
+    submit([make_run("4dgs", device="cuda (Test)", seconds=9.0)], tmp_path / "e")
+    write_site(read_entries(tmp_path / "e").values(), load_published(), tmp_path / "site")
+    page = tmp_path / "site/scene/plaza.html"
+    head = Page(page).rows[0]
+    assert "training [s], cpu (Test, 2 threads)" in head and "training [s], cuda (Test)" in head
+    assert "code: 1111111111-dirty" in page.read_text()
+
+
 def test_commands_make_the_run_again(make_run, tmp_path):
     submit([make_run(variant="sh_degree=2,budget=90s", max_width=800)], tmp_path / "e")
     write_site(read_entries(tmp_path / "e").values(), load_published(), tmp_path / "site")

@@ -19,7 +19,7 @@ from chronoscene.cli.output import (
 )
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
-from chronoscene.harness.files.ground_truth import ground_truth_folder
+from chronoscene.harness.files.ground_truth import truth_of
 from chronoscene.harness.report.between_figure import between_csv, between_table, draw_between
 from chronoscene.harness.report.comparison_figure import by_scene, chosen_views, draw_figures
 from chronoscene.harness.report.comparison_page import comparison_page
@@ -89,15 +89,17 @@ def command(
         _refuse_options()
         compare_between(runs, periods, style, out, scene, plugin)
         return
-    name = metric_info(metric).name
+    metric = metric_info(metric).name
     records, failures = read_runs([runs])
-    scores = view_scores(records, name)
-    worst = list(worst_views(scores, records, name))
+    scores = view_scores(records, metric)
+    worst = list(worst_views(scores, records, metric))
     if style == "csv":
         emit(scores.to_csv(lineterminator="\n"), out)
     else:
         width = terminal_width(out)
         emit("\n".join(boxed_text(table, width=width) for table in worst), out)
+    for name in sorted({run.scene for run in records} - by_scene(records).keys()):
+        click.echo(f"{name}: no pictures, as its runs are not of the frozen photos", err=True)
     with writing_to("RUNS", runs):
         report_written(*draw_figures(runs, records, views_per_period=views))
     if html is not None:
@@ -132,7 +134,7 @@ def compare_between(
         for name, chosen in by_scene(records).items():
             opened = [open_run(record.folder, plugin=plugin) for record in chosen]
             dates = parse_dates(opened[0], periods)
-            views = chosen_views(ground_truth_folder(runs, name), 1)
+            views = chosen_views(truth_of(chosen[0].folder), 1)
             if not (own := [v.view for v in views if v.camera_period in dates]):
                 raise ConfigError(
                     f"--periods {periods}",

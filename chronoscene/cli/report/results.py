@@ -10,6 +10,7 @@ import click
 from chronoscene.cli.options import EXISTING_FOLDER, LPIPS_WEIGHTS, RUNS, split_list
 from chronoscene.cli.output import FORMAT, OUT_FILE, emit, terminal_width
 from chronoscene.cli.progress import progress_bar
+from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RESULTS_FILE, ROWS_FILE
 from chronoscene.harness.report.comparison_figure import draw_figures
 from chronoscene.harness.report.published import load_published
@@ -105,10 +106,23 @@ def print_runs(out: Path) -> None:
 @click.option(
     "--periods", is_flag=True, help=f"Show every period where there are more than {MAX_PERIODS}."
 )
+@click.option(
+    "--columns",
+    help="Columns to show and no others, by their heads, as HEAD[,HEAD...]; units may be left out.",
+)
+@click.option(
+    "--rename",
+    "renames",
+    metavar="OLD=NEW",
+    multiple=True,
+    help="Write NEW in place of OLD, which is part of the name of a method. May be repeated.",
+)
 @OUT_FILE
 def table(
     folders: tuple[Path, ...],
     style: str,
+    columns: str | None,
+    renames: tuple[str, ...],
     metrics: tuple[str, ...],
     region: str,
     with_published: bool,
@@ -128,11 +142,35 @@ def table(
         records = in_region(records, region)
     published = load_published() if with_published else None
     width = terminal_width(out)
-    wanted = parse_metrics(metrics)
     text = format_runs(
-        records, failures, style, wanted, published=published, periods=periods, width=width
+        records,
+        failures,
+        style,
+        parse_metrics(metrics),
+        published=published,
+        periods=periods,
+        renames=dict(_pair(text) for text in renames),
+        columns=_columns(columns, style),
+        width=width,
     )
     emit(text, out)
+
+
+def _columns(text: str | None, style: str) -> tuple[str, ...]:
+    if text is not None and style in ("csv", "json"):
+        raise ConfigError(
+            "--columns", expected=f"none with {style}", found=repr(text), todo="leave it out"
+        )
+    return () if text is None else split_list("--columns", text)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    old, _, new = text.rpartition("=")  # names have options, such as sh_degree=2
+    if not old:
+        raise ConfigError(
+            "--rename", expected="OLD=NEW", found=repr(text), todo="write the old name first"
+        )
+    return old, new
 
 
 def parse_metrics(texts: tuple[str, ...]) -> list[str]:

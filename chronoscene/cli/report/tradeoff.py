@@ -19,7 +19,7 @@ from chronoscene.cli.output import (
     writing_to,
 )
 from chronoscene.errors import ConfigError
-from chronoscene.harness.files.records import FIGURES, Failure, RunRecord
+from chronoscene.harness.files.records import FIGURES, RunRecord
 from chronoscene.harness.plan.stop import parse_duration
 from chronoscene.harness.report.summary import COSTS, read_runs, summarise
 from chronoscene.harness.report.tables import COST_TITLES, footnotes, tables_text
@@ -92,7 +92,8 @@ def command(
         return
     curves = [whole_curve(read_curve(run.folder), run.strategy) for run in records]
     points, times = front_points(records), curve_values(records, curves)
-    emit(_text(points, times, _notes(records, failures), style, out), out)
+    notes = footnotes(summarise(records).assign(tied=False), records, failures)
+    emit(_text(points, times, notes, style, out), out)
     if len(points):
         figure = (figures or folders[0] / FIGURES) / FIGURE
         with writing_to("--figures", figure):
@@ -116,15 +117,6 @@ def parse_size(text: str) -> float:
             todo="write a number with the unit kB, MB or GB",
         )
     return size
-
-
-def _notes(records: Sequence[RunRecord], failures: Sequence[Failure]) -> list[str]:
-    """Return footnotes on the runs, and on widths that differ."""
-    notes = footnotes(summarise(records).assign(tied=False), records, failures)
-    if len(widths := sorted({run.max_width for run in records})) > 1:
-        sizes = ", ".join(map(str, widths))
-        notes.append(f"scored at several --max-width ({sizes}): smaller images are easier")
-    return notes
 
 
 def _text(

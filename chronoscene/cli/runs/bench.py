@@ -36,6 +36,17 @@ from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
 
 SOME_FAILED = 1  # Exit status when a run failed; the others have their results
+BUDGET = click.option(
+    "--budget",
+    help="Stop after this time on the training clock, such as 90s, 5m or 1h30m. Schedules follow "
+    "the clock then, and equal seeds do not give equal models.",
+)
+WIDTH = click.option(
+    "--max-width",
+    type=click.IntRange(min=1),
+    default=MAX_WIDTH,
+    help="Scale wider images down to this width in pixels, for training and evaluation.",
+)
 
 
 @click.command("bench")
@@ -57,11 +68,7 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
     default=0,
     help="First seed. Equal seeds give equal models on one machine's CPU, but not with --budget.",
 )
-@click.option(
-    "--budget",
-    help="Stop after this time on the training clock, such as 90s, 5m or 1h30m. Schedules follow "
-    "the clock then, and equal seeds do not give equal models.",
-)
+@BUDGET
 @click.option(
     "--continue-to",
     type=click.IntRange(min=1),
@@ -84,12 +91,7 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
     "iterations and budget or each get them.  [default: total; each for presets whose iterations "
     "are per period]",
 )
-@click.option(
-    "--max-width",
-    type=click.IntRange(min=1),
-    default=MAX_WIDTH,
-    help="Scale wider images down to this width in pixels, for training and evaluation.",
-)
+@WIDTH
 @click.option(
     "--photo-memory",
     type=click.FloatRange(min=0),

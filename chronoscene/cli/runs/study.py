@@ -15,7 +15,7 @@ from chronoscene.cli.options import (
     training_options,
 )
 from chronoscene.cli.output import emit, terminal_width
-from chronoscene.cli.runs.bench import SOME_FAILED, settings_from
+from chronoscene.cli.runs.bench import BUDGET, SOME_FAILED, WIDTH, settings_from
 from chronoscene.harness.study.plan import find_study, read_study, run_study
 from chronoscene.harness.study.tables import study_texts
 
@@ -27,6 +27,8 @@ ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 @SCENES
 @reading_options("the scenes")
 @training_options
+@BUDGET
+@WIDTH
 @LPIPS_WEIGHTS
 @RUNS_OUT
 def command(name: str, seeds: int, **options: Any) -> None:

@@ -19,6 +19,11 @@ def ground_truth_folder(runs: Path, scene: str) -> Path:
     return runs / GROUND_TRUTH / safe_part(scene)
 
 
+def truth_of(run: Path) -> Path:
+    """Return the folder of the ground truth of a run, by its folder."""
+    return run.parents[2] / GROUND_TRUTH / run.parents[1].name
+
+
 def freeze_ground_truth(
     runs: Path, scene: Scene, scene_hash: str, store: ImageStore, max_width: int
 ) -> Manifest:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from chronoscene.errors import CheckpointError
 from chronoscene.io.documents import read_json_document
@@ -38,6 +39,14 @@ GROUND_TRUTH = "ground_truth"
 PHOTOS = "photos"
 FIGURES = "figures"
 
+
+def _number(value: float) -> float:
+    if math.isnan(value):
+        raise ValueError("not a number")
+    return value
+
+
+Number = Annotated[float, AfterValidator(_number)]
 Values = dict[str, float]
 Document = TypeVar("Document", bound=BaseModel)
 Line = TypeVar("Line", bound="CurvePoint | ViewScore")
@@ -85,11 +94,11 @@ class RunRecord(BaseModel):
     """Strategy that was run, which may differ from the one asked for; see `notices`."""
     scene: str
     seed: int
-    aggregates: dict[str, Values]
+    aggregates: dict[str, dict[str, Number]]
     """``macro`` (mean over periods), ``micro`` (mean over views), ``worst`` (worst period)."""
-    periods: dict[str, Values]
+    periods: dict[str, dict[str, Number]]
     """Mean over the views of each period, by period id."""
-    regions: dict[str, dict[str, dict[str, Values]]] = {}
+    regions: dict[str, dict[str, dict[str, dict[str, Number]]]] = {}
     """``changed`` and ``invariant`` to ``aggregates`` and ``periods`` of these parts of the images;
     empty where there are no change masks."""
     change_masks: str | None = None
@@ -99,14 +108,14 @@ class RunRecord(BaseModel):
     under `UNTRAINED`. A stage has the periods so far and the next one."""
     transfer: dict[str, Values] = {}
     """Effect of stages on earlier and later periods; see `chronoscene.harness.score.forgetting`."""
-    seconds: float | None
+    seconds: Number | None
     """Training clock: setup and steps, without probes, rendering and scoring. None here and below:
     not measured; see `absent`."""
     iterations: int | None
     primitives: int | None
     primitive: str = "primitives"
     """Unit of `primitives`: ``Gaussians``, ``anchors``."""
-    drawn: float | None = None
+    drawn: Number | None = None
     """Gaussians that touch a test view, mean over the views; None if the method does not say."""
     sharing: PeriodSharing | None = None
     """Account of what the periods share in the model."""
@@ -146,7 +155,7 @@ class RunRecord(BaseModel):
     """Waiting for photos that were not decoded yet; not part of `seconds`."""
     setup_seconds: float | None
     """Share of `seconds` before the first step."""
-    render_seconds: float | None
+    render_seconds: Number | None
     """Mean time to render a test view, by the model as it was saved and loaded again."""
     peak_device_memory_bytes: int | None
     """Largest memory held on a GPU; None on a CPU."""

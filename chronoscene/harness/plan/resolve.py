@@ -69,7 +69,8 @@ class ResolvedMethod:
             if settings.iterations is not None:
                 differ["iterations"] = settings.iterations
             differ["budget"] = f"{settings.budget_seconds:g}s"
-        if settings.separate_iterations != self._own_sharing:
+        budget_each = settings.separate_iterations == "each" and settings.budget_seconds is not None
+        if budget_each or settings.separate_iterations != self._own_sharing:
             differ["separate_iterations"] = settings.separate_iterations
         if settings.validation:
             differ["validation"] = True

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.figures import canvas
-from chronoscene.harness.files.ground_truth import ground_truth_folder
+from chronoscene.harness.files.ground_truth import truth_of
 from chronoscene.harness.files.predictions import (
     ImageEntry,
     load_image,
@@ -50,7 +50,7 @@ def draw_figures(
     written = []
     for scene, found in by_scene(records).items():
         methods = [shown_run(record) for record in found]
-        truth = ground_truth_folder(runs, scene)
+        truth = truth_of(found[0].folder)
         labels = found[0].period_labels
         rows = chosen_views(truth, views_per_period)
         if not rows:  # trained on all photos
@@ -63,9 +63,17 @@ def draw_figures(
 
 
 def by_scene(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
-    """Choose the runs that are shown in pictures: `first_seeds` of each scene."""
-    scenes = dict.fromkeys(record.scene for record in records)
-    return {scene: first_seeds([r for r in records if r.scene == scene]) for scene in scenes}
+    """Choose the runs that are shown in pictures: `first_seeds` of each scene.
+
+    A test that is not that of the frozen photos has none.
+    """
+    scenes: dict[str, list[RunRecord]] = {}
+    for run in records:
+        truth = read_manifest(truth_of(run.folder))
+        width = truth.details.get("max_width", run.max_width)
+        if (truth.scene_hash, width) == (run.scene_hash, run.max_width):
+            scenes.setdefault(run.scene, []).append(run)
+    return {scene: first_seeds(found) for scene, found in scenes.items()}
 
 
 def first_seeds(records: Sequence[RunRecord]) -> list[RunRecord]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene import __version__
-from chronoscene.harness.files.ground_truth import ground_truth_folder
+from chronoscene.harness.files.ground_truth import truth_of
 from chronoscene.harness.files.predictions import ImageEntry, load_image, load_mask, read_manifest
 from chronoscene.harness.files.records import Failure, RunRecord
 from chronoscene.harness.report.comparison_figure import (
@@ -70,13 +70,13 @@ def comparison_page(
     """
     entries = summarise(records)
     found = by_scene(records)
-    views = _shown_views(runs, found, max_bytes)
+    views = _shown_views(found, max_bytes)
     scenes = [
         {
             "name": scene,
             "curves": draw_curves(of_scene),
             "views": views[scene],
-            "total": len(read_manifest(ground_truth_folder(runs, scene)).images),
+            "total": len(read_manifest(truth_of(of_scene[0].folder)).images),
         }
         for scene, of_scene in found.items()
     ]
@@ -92,14 +92,13 @@ def comparison_page(
     )
 
 
-def _shown_views(
-    runs: Path, found: dict[str, list[RunRecord]], max_bytes: int
-) -> dict[str, list[ShownView]]:
+def _shown_views(found: dict[str, list[RunRecord]], max_bytes: int) -> dict[str, list[ShownView]]:
     """Return views of each scene, as many of each period as fit."""
     methods = {scene: [*map(shown_run, of_scene)] for scene, of_scene in found.items()}
 
     def draw(scene: str, per_period: int) -> Iterator[ShownView]:
-        truth, labels = ground_truth_folder(runs, scene), found[scene][0].period_labels
+        first = found[scene][0]
+        truth, labels = truth_of(first.folder), first.period_labels
         for entry in chosen_views(truth, per_period):
             yield _shown_view(truth, entry, methods[scene], labels)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,15 +14,11 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import CheckpointError, ConfigError
-from chronoscene.harness.files.records import (
-    Failure,
-    RunRecord,
-    read_failures,
-    read_with_rows,
-    run_folders,
-)
+from chronoscene.harness.files.records import Failure, RunRecord, read_failures, run_folders
+from chronoscene.harness.report.comparable import apart, each_once
 from chronoscene.harness.report.intervals import REPLICATES, interval, resampled_means, seed_margin
 from chronoscene.harness.score.regions import ALL
+from chronoscene.harness.score.scoring import read_scored
 from chronoscene.metrics.registry import all_metrics, metric_info
 
 if TYPE_CHECKING:
@@ -110,6 +107,9 @@ COSTS = (
     Cost("peak_device_memory_bytes", "peak GPU memory [MB]", factor=1e-6),
 )
 
+TIMES = ("seconds", "render_seconds")
+"""Costs that are compared on one device only."""
+
 SHARING = (
     Cost("invariant_share", "invariant [%]", factor=100, decimals=1),
     Cost("mean_blocks", "blocks each", decimals=2),
@@ -138,13 +138,16 @@ the two.
 def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
     """Read all finished runs below some folders, with their rows, and the failed ones.
 
+    Copies of a run count once, and each test of a scene has a name of its own (`comparable`).
+
     Raises:
-        CheckpointError: If a folder holds neither.
+        CheckpointError: If a folder holds neither, or a run is damaged.
+        ConfigError: If a seed is there twice, with different values.
     """
     records: list[RunRecord] = []
     failures: list[Failure] = []
     for folder in folders:
-        found = [read_with_rows(path) for path in run_folders(folder)]
+        found = [read_scored(path) for path in run_folders(folder)]
         failed = read_failures(folder)
         if not found and not failed:
             raise CheckpointError(
@@ -152,14 +155,14 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
             )
         records += found
         failures += failed
-    return records, failures
+    return apart(each_once(records)), failures
 
 
 def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
     """Return runs with the scores of a region in place of those of whole images.
 
-    Their scenes are called ``<scene> (<region>)`` and have the fingerprint of the change masks, so
-    they stand beside no other values. Runs of scenes without change masks are left out.
+    Their scenes are called ``<scene> (<region>)``, and the fingerprint of the change masks takes
+    the place of that of the test views. Runs of scenes without change masks are left out.
 
     Raises:
         ConfigError: If none is left.
@@ -169,7 +172,7 @@ def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
             update={
                 **run.regions[region],
                 "scene": f"{run.scene} ({region})",
-                "scene_hash": run.change_masks,
+                "split_hash": run.change_masks,
                 "rows": [replace(row, region=ALL) for row in run.rows if row.region == region],
                 "stages": {},  # these are of whole images
                 "transfer": {},
@@ -185,15 +188,15 @@ def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
             found="none",
             todo="run chronoscene score RUNS --truth FOLDER first",
         )
-    return found
+    return apart(found)
 
 
 def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> DataFrame:
     """Compute means, spread over seeds and intervals over views of everything that was measured.
 
-    Runs that differ in seed and device only are a group. Runs of equal names with other scenes or
-    configs stay apart, and so do devices that ran the same seed: their ``label`` says in what they
-    differ.
+    Runs that differ in seed, device and commit only are a group. Runs of equal names with other
+    configs stay apart, and so do devices or commits that ran the same seed: their ``label`` says in
+    what they differ.
 
     Args:
         records: Runs of any scenes.
@@ -201,7 +204,8 @@ def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> Data
 
     Returns:
         `ENTRY_COLUMNS`, ``label``, and the columns that `with_texts` and `compared` add, one row
-        per group, quantity and column. What a run of a group lacks is left out.
+        per group, quantity and column. What a run of a group lacks is left out, and so are `TIMES`
+        of several devices.
     """
     import pandas as pd
 
@@ -226,7 +230,8 @@ def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> Data
     entries = values.value.agg(mean=mean, sd=spread, n="size")
     entries["resampled"] = [np.mean(list(part), axis=0) for _, part in values.resampled]
     entries = entries.reset_index().join(groups, on=["scene", "label"])
-    entries = entries[entries.n == entries.runs].assign(source=MEASURED)
+    mixed = entries.quantity.isin(TIMES) & (entries.devices > 1)
+    entries = entries[(entries.n == entries.runs) & ~mixed].assign(source=MEASURED)
     order = list(dict.fromkeys(run.scene for run in records))
     entries = entries.sort_values(
         "scene", key=lambda scenes: scenes.map(order.index), kind="stable", ignore_index=True
@@ -359,21 +364,27 @@ def labelled(records: Sequence[RunRecord]) -> DataFrame:
     differences = pd.DataFrame(
         {
             "method": runs.method,
-            "scene": [f"scene {run.scene_hash[:6]}" for run in records],
             "config": [f"config {run.config_hash[:6]}" for run in records],
             "device": runs.device,
+            "commit": [f"code {short_commits(run.commit)}" for run in records],
         }
     )
     named = [runs.scene, runs.label]
     differ = differences.groupby(named).transform("nunique") > 1
-    # Seeds of several devices are averaged; the same seed on two of them compares these.
-    same = [*named, runs.method, differences.scene, differences.config]
-    devices = runs.device.groupby([*same, runs.seed]).transform("nunique")
-    differ["device"] = devices.groupby(same).transform("max") > 1
+    # Seeds of several devices or commits are averaged; the same seed of two compares these.
+    same = [*named, runs.method, differences.config]
+    for name in ("device", "commit"):
+        several = differences[name].groupby([*same, runs.seed]).transform("nunique")
+        differ[name] = several.groupby(same).transform("max") > 1
     for i, columns in enumerate(differ.to_numpy()):
         if columns.any():
             runs.loc[i, "label"] += f" [{', '.join(differences.loc[i, columns])}]"
     return runs
+
+
+def short_commits(commits: str) -> str:
+    """Shorten hashes of commits to ten digits; ``-dirty`` stays."""
+    return re.sub(r"\b([0-9a-f]{10})[0-9a-f]{30}\b", r"\1", commits)
 
 
 def kind_of(run: RunRecord | Failure) -> str:

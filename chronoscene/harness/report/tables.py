@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import UNTRAINED, Failure, RunRecord
 from chronoscene.harness.files.strategies import period_part
+from chronoscene.harness.report.comparable import effort_of, several_scenes
 from chronoscene.harness.report.summary import (
     AGGREGATES,
     COSTS,
@@ -17,6 +21,7 @@ from chronoscene.harness.report.summary import (
     PAPER_METRICS,
     SHARING,
     SIZE,
+    TIMES,
     TRANSFERS,
     in_unit,
     kind_of,
@@ -50,6 +55,8 @@ def format_runs(
     *,
     published: PublishedTable | None = None,
     periods: bool = False,
+    renames: Mapping[str, str] | None = None,
+    columns: Sequence[str] = (),
     width: int | None = None,
 ) -> str:
     """Format all tables of some runs in one of `chronoscene.io.tables.FORMATS`.
@@ -61,6 +68,8 @@ def format_runs(
         metrics: Names of those wanted, without costs; none for all, and costs.
         published: Printed numbers to show beside the runs in the overview.
         periods: Show every period of scenes with more than `MAX_PERIODS`, too.
+        renames: Parts of the names of methods, and what to write instead.
+        columns: Heads of columns to show, with or without their unit; none for all.
         width: Characters of the terminal that ``table`` goes to; None for no limit.
     """
     import pandas as pd
@@ -71,6 +80,7 @@ def format_runs(
         printed = published_entries(published, scenes)
         wanted = printed.quantity.isin(metrics) if metrics else slice(None)
         entries = pd.concat([entries, printed[wanted]])
+    entries = entries.assign(label=entries.label.map(_renamed(entries.label.unique(), renames)))
     listed = entries[entries.quantity.isin(metrics)] if metrics else entries
     if style == "csv":
         # NaN is a spread that is not defined, an empty cell that there is none.
@@ -84,9 +94,55 @@ def format_runs(
         found = [json_entry(entry) for entry in listed[[*ENTRY_COLUMNS]].to_dict("records")]
         return json.dumps({"entries": found, "notes": notes}, indent=1, allow_nan=False) + "\n"
     made = readable_tables(entries, records, metrics, periods=periods)
+    made = with_columns(made, columns) if columns else made
     if any(table.ranks for table in made):
         notes.insert(0, tables.LEGENDS[style])
     return tables_text(made, notes, style, width=width)
+
+
+def _renamed(labels: Iterable[str], renames: Mapping[str, str] | None) -> dict[str, str]:
+    """Return new names of methods by the old ones."""
+    names = {label: label for label in labels}
+    for old, new in (renames or {}).items():
+        changed = {label: name.replace(old, new) for label, name in names.items()}
+        if changed == names or len({*changed.values()}) < len(changed) or "" in changed.values():
+            raise ConfigError(
+                f"--rename {old}={new}",
+                expected="a part of names that differ afterwards, too",
+                found=f"the names {', '.join(map(repr, names.values()))}",
+                todo="correct it",
+            )
+        names = changed
+    return names
+
+
+def with_columns(made: Iterable[Table], names: Sequence[str]) -> list[Table]:
+    """Keep the columns with some heads; tables without any are left out.
+
+    Raises:
+        ConfigError: If a name is the head of no column.
+    """
+    kept, known = [], set()
+    for table in made:
+        chosen, heads, group, last = [*range(table.labels)], [*table.heads[: table.labels]], "", ""
+        for j, (first, second) in [*enumerate(table.heads)][table.labels :]:
+            group = first or group
+            texts = {text for text in (group, second, table.flat_heads[j]) if text}
+            texts |= {text.partition(" [")[0] for text in texts}  # without the unit
+            known |= texts
+            if texts & {*names}:
+                chosen.append(j)
+                heads.append(("" if group == last else group, second))
+                last = group
+        places = {old: new for new, old in enumerate(chosen)}
+        rows = [[row[j] for j in chosen] for row in table.rows]
+        ranks = {(i, places[j]): rank for (i, j), rank in table.ranks.items() if j in places}
+        ties = {(i, places[j]) for i, j in table.ties if j in places}
+        if len(chosen) > table.labels:
+            kept.append(replace(table, heads=heads, rows=rows, ranks=ranks, ties=ties))
+    for name in names:
+        check_choice("--columns", name, sorted(known))
+    return kept
 
 
 def tables_text(
@@ -200,7 +256,8 @@ def _overviews(entries: DataFrame, names: Sequence[str], *, size: bool) -> Itera
     parts = [(str(scene), part) for scene, part in entries.groupby("scene", sort=False)]
     title = f"{parts[0][0]}: macro means"
     if several := len(parts) > 1:
-        parts.append((ALL_SCENES, over_scenes(entries, ALL_SCENES)))
+        if several_scenes(scene for scene, _ in parts):
+            parts.append((ALL_SCENES, over_scenes(entries, ALL_SCENES)))
         title = "all scenes: macro means"
         if len(names) == 1:
             title = f"all scenes: {metric_info(names[0]).title} ({names[0]}), macro"
@@ -321,9 +378,15 @@ def _stage_tables(
 def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str] = ()) -> Table:
     """Make the table of macro means and costs of the runs on one scene."""
     costs, macro = part[part.column == ""], part[part.column == "macro"]
-    shown = [cost for cost in COSTS if (costs.quantity == cost.name).any()]
     columns = [_Column((metric_info(m).title, ""), macro[macro.quantity == m]) for m in metrics]
-    columns += [_Column((cost.title, ""), costs[costs.quantity == cost.name]) for cost in shown]
+    for cost in COSTS:
+        found = costs[costs.quantity == cost.name]
+        if cost.name in TIMES and found.device.nunique() > 1:
+            heads = [cost.title, *[""] * (found.device.nunique() - 1)]
+            by_device = zip(heads, found.groupby("device", sort=False), strict=True)
+            columns += [_Column((head, device), part) for head, (device, part) in by_device]
+        elif len(found):
+            columns.append(_Column((cost.title, ""), found))
     columns.append(_Column(("seeds", ""), part.drop_duplicates("label"), "seeds"))
     title = f"{scene}: macro means and cost" if metrics else f"{scene}: cost"
     return _table(title, part.label.unique(), columns)
@@ -362,7 +425,13 @@ def footnotes(
             notes.append(f"{title}: {'; '.join(values)}")
     mixed = entries[entries.devices > 1].label.unique()
     if len(mixed):
-        notes.append(f"seeds of several devices are averaged, costs too: {'; '.join(mixed)}")
+        notes.append(
+            f"seeds of several devices are averaged, but for their times: {'; '.join(mixed)}"
+        )
+    if any(len({effort_of(r) for r in records if r.scene == s}) > 1 for s in {*entries.scene}):
+        efforts = _grouped((effort_of(run), f"{run.title} ({run.preset})") for run in records)
+        said = "; ".join(f"{effort}: {names}" for effort, names in efforts)
+        notes.append(f"efforts differ, and a difference may be theirs: {said}")
     counted = [(r.primitive, r.title) for r in records if r.primitives is not None and not wanted]
     if entries.quantity.isin([cost.name for cost in SHARING]).any() and not wanted:
         notes.append(

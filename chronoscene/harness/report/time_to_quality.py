@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from chronoscene.harness.files.records import CURVE_FILE, CurvePoint, RunRecord, read_lines
 from chronoscene.harness.files.strategies import STRATEGIES
+from chronoscene.harness.report.comparable import several_scenes
 from chronoscene.harness.report.summary import labelled, spread, with_spread
 from chronoscene.harness.report.tables import ALL_SCENES
 from chronoscene.io.tables import Table
@@ -114,7 +115,7 @@ def curve_values(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -
         seeds = seeds.groupby(keys, sort=False, dropna=False).value
         values = seeds.agg(mean=mean, sd=spread, n="size").reset_index()
         parts.append(values[np.isfinite(values["mean"])])
-        if parts[-1].scene.nunique() > 1:
+        if several_scenes(parts[-1].scene):
             parts.append(_over_scenes(parts[-1]).assign(scene=ALL_SCENES, device=device))
     found = pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
     found = found[[*VALUE_COLUMNS]].astype({"at": object, "sd": object})

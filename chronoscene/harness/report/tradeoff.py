@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.command_line import command_line
 from chronoscene.harness.files.records import RunRecord
+from chronoscene.harness.report.comparable import several_scenes
 from chronoscene.harness.report.summary import (
     PAPER_METRICS,
     SIZE,
+    TIMES,
     metric_names,
     over_scenes,
     summarise,
@@ -29,12 +32,10 @@ from chronoscene.metrics.registry import metric_info
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-TIMES = ("seconds", "render_seconds")
-"""Costs that are compared on one device only."""
 DRAWN_COSTS = (*TIMES, SIZE, "peak_memory_bytes", "peak_device_memory_bytes")
 BUDGET_TOLERANCE = 0.05
-"""Share by which a training may exceed a time and still count as one that took it: a budget ends it
-after the step in which it runs out."""
+"""Share by which a training, without its last step, may exceed a time and still count as one that
+took it: a budget ends it after the step in which it runs out."""
 ANY_DEVICE = ""
 FRONT_COLUMNS = (
     *("scene", "device", "metric", "cost", "label", "method", "strategy", "preset", "variant"),
@@ -73,7 +74,7 @@ def entries_by_device(records: Sequence[RunRecord]) -> dict[str, DataFrame]:
     found = {}
     for device in (*dict.fromkeys(run.device for run in records), ANY_DEVICE):
         entries = summarise([run for run in records if device in (ANY_DEVICE, run.device)])
-        if entries.scene.nunique() > 1:
+        if several_scenes(entries.scene):
             entries = pd.concat([entries, over_scenes(entries, ALL_SCENES)], ignore_index=True)
         found[device] = entries
     return found
@@ -170,11 +171,12 @@ class Limits:
         """Return the largest ratio to a limit (of mean squared errors for PSNR), at most 1 if kept.
 
         Args:
-            found: Mean ``seconds``, `SIZE` and ``psnr`` of a configuration.
+            found: Mean ``seconds``, `SIZE`, ``psnr`` and ``iterations`` of a configuration.
         """
         ratios = [0.0]
         if self.seconds is not None:
-            ratios.append(found["seconds"] / (self.seconds * (1 + BUDGET_TOLERANCE)))
+            before = found["seconds"] * (1 - 1 / found["iterations"])
+            ratios.append(before / (self.seconds * (1 + BUDGET_TOLERANCE)))
         if self.size is not None:
             ratios.append(found[SIZE] / self.size)
         if self.psnr is not None:
@@ -186,7 +188,7 @@ def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[st
     """Name the configuration to use within limits, in a sentence for each scene and device.
 
     It is the best one in PSNR; where a PSNR is to be reached, the one that is trained in the least
-    time.
+    time. Among those that read alike, it is the best in the other one, and then the smallest.
 
     Args:
         records: Runs of any scenes.
@@ -201,15 +203,16 @@ def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[st
     for device, entries in entries_by_device(records).items():
         for scene, part in entries.groupby("scene", sort=False) if device else ():
             place = f"{scene}, {device}"
-            found = sorted(_configurations(part), key=limits.excess)
+            found = sorted(_configurations(part), key=_best_first)
             fitting = [config for config in found if limits.excess(config) <= 1]
             if fitting and limits.psnr is not None:
-                best = min(fitting, key=lambda config: config["seconds"])
+                best = min(fitting, key=lambda config: round(config["seconds"], 1))
             elif fitting:
-                best = max(fitting, key=lambda config: config["psnr"])
+                best = fitting[0]
             elif found:
-                near = _sentence(found[0])
-                candidate = limits.excess(found[0]), f"{near} on {place}"
+                nearest_one = min(found, key=lambda config: round(limits.excess(config), 2))
+                near = _sentence(nearest_one)
+                candidate = limits.excess(nearest_one), f"{near} on {place}"
                 nearest = min(filter(None, (nearest, candidate)))
                 sentences.append(f"{place}: nothing fits {wanted}; nearest: {near}")
                 continue
@@ -236,8 +239,13 @@ def _configurations(entries: DataFrame) -> list[dict[str, Any]]:
         if all(name in known.index for name in quantities):
             means = {name: float(known["mean"][name]) for name in quantities}
             texts = {f"{name}_text": known.text[name] for name in quantities}
+            means["iterations"] = known["mean"].get("iterations", math.inf)
             found.append({**part.iloc[0], **means, **texts})
     return found
+
+
+def _best_first(config: dict[str, Any]) -> tuple[float, float, float]:
+    return -round(config["psnr"], 2), config["seconds"], config[SIZE]
 
 
 def _sentence(config: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, replace
@@ -15,6 +16,8 @@ from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import ImageEntry, Manifest, load_image, read_manifest
 from chronoscene.harness.files.records import (
     PREDICTIONS,
+    ROWS_FILE,
+    RUN_FILE,
     STAGES,
     UNTRAINED,
     RunRecord,
@@ -22,6 +25,7 @@ from chronoscene.harness.files.records import (
     ViewScore,
     read_rows,
     read_run,
+    read_with_rows,
     run_folders,
     write_run,
     write_summary,
@@ -218,6 +222,30 @@ def aggregate(
         for period, mean in means.items():
             periods.setdefault(str(period), {})[metric] = mean
     return aggregates, dict(sorted(periods.items(), key=lambda item: int(item[0])))
+
+
+def read_scored(folder: Path) -> RunRecord:
+    """Read a finished run with the values of its views, and compare its means with these.
+
+    Raises:
+        CheckpointError: If a file is missing or damaged, or a mean is not that of the views.
+    """
+    run = read_with_rows(folder)
+    for region in (ALL, *run.regions):
+        parts = run.regions.get(region, {"aggregates": run.aggregates, "periods": run.periods})
+        stored = {name: values for part in parts.values() for name, values in part.items()}
+        aggregates, periods = aggregate(run.rows, region)
+        for name, means in (aggregates | periods).items():
+            for metric, mean in means.items():
+                found = stored.get(name, {}).get(metric, math.nan)
+                if not math.isclose(found, mean, rel_tol=1e-6, abs_tol=1e-6):
+                    raise CheckpointError(
+                        folder / RUN_FILE,
+                        expected=f"{mean:.6g} as {metric}, {name}: the mean of {ROWS_FILE}",
+                        found=f"{found:.6g}",
+                        todo="compute both again with chronoscene score RUNS",
+                    )
+    return run
 
 
 def changes(before: Mapping[str, Values], after: Mapping[str, Values]) -> list[str]:

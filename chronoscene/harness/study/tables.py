@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chronoscene.harness.files.records import Failure, RunRecord, read_with_rows
+from chronoscene.harness.files.records import Failure, RunRecord
+from chronoscene.harness.report.comparable import apart
 from chronoscene.harness.report.summary import (
     ENTRY_COLUMNS,
     MEASURED,
@@ -19,6 +20,7 @@ from chronoscene.harness.report.summary import (
     summarise,
 )
 from chronoscene.harness.report.tables import COST_TITLES, footnotes, interval_text, json_entry
+from chronoscene.harness.score.scoring import read_scored
 from chronoscene.harness.study.plan import Study
 from chronoscene.io import tables
 from chronoscene.io.tables import Table
@@ -208,7 +210,8 @@ def study_texts(
     Returns:
         ``table`` (for a terminal), ``markdown``, ``csv`` and ``json``.
     """
-    runs = {label: list(map(read_with_rows, paths)) for label, paths in finished.items()}
+    records = apart([read_scored(path) for paths in finished.values() for path in paths])
+    runs = {label: [r for r in records if r.folder in paths] for label, paths in finished.items()}
     entries = study_entries(study, runs)
     table, sentences = study_table(study, entries), directions(study, entries)
     notes = [
@@ -217,7 +220,6 @@ def study_texts(
         *([f"published: {study.source}"] if study.source else []),
         *study.notes,
     ]
-    records = [run for rows in runs.values() for run in rows]
     measured = entries[entries.source == MEASURED].assign(tied=False)
     notes += footnotes(measured, records, failures)
     listed = entries[[*COLUMNS]]

@@ -1,16 +1,17 @@
 """``chronoscene compare``: table, figures, page."""
 
 import csv
+from shutil import rmtree
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from made_runs import scored
+from made_runs import scored, write_scored
 
 from chronoscene.cli import cli
 from chronoscene.errors import ChronoSceneError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
-from chronoscene.harness.files.predictions import ImageWriter
+from chronoscene.harness.files.predictions import ImageWriter, safe_name
 from chronoscene.harness.files.records import PREDICTIONS, write_run
 
 
@@ -48,6 +49,23 @@ def test_the_worst_views_are_printed_and_figures_drawn(runs, tmp_path):
     text = page.read_text()
     assert text.startswith("<!doctype html>") and text.count('class="slider"') == 2
     assert "training time" not in text
+
+
+def test_runs_of_another_width_have_no_pictures(tmp_path):
+    runs = tmp_path / "runs"
+    write_scored(runs, "3dgs")
+    folder = write_scored(runs, "4dgs", max_width=4)
+    rmtree(folder / PREDICTIONS)
+    writer = ImageWriter(folder / PREDICTIONS)
+    for row in scored(psnr=((1.0,) * 3,) * 2).rows:
+        pixels, period = np.zeros((3, 4, 3), np.uint8), row.camera_period
+        writer.add(row.view, pixels, camera_period=period, rendered_period=period)
+    writer.close(kind="predictions", scene="plaza", scene_hash="a" * 64, details={})
+    result = compare(runs, "--html", tmp_path / "page.html")
+    assert "plaza [width 4]: no pictures" in result.stderr
+    figures = [f"plaza [width 1600]_{name}.png" for name in ("comparison", "errors")]
+    assert sorted(p.name for p in (runs / "figures").iterdir()) == [*map(safe_name, figures)]
+    assert "cannot be compared, and stand apart" in (tmp_path / "page.html").read_text()
 
 
 def test_csv_has_every_view_and_more_views_make_more_rows(runs, tmp_path):

@@ -4,9 +4,11 @@ import csv
 import io
 import json
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 from click.testing import CliRunner
+from made_runs import write_scored
 
 import chronoscene.cli.report.results as results_module
 from chronoscene.cli import cli
@@ -99,9 +101,124 @@ def test_files_are_written_whole(runs, tmp_path):
     assert [p.name for p in out.parent.iterdir()] == ["table.csv"]
 
 
-def test_folders_add_up(runs):
-    document = json.loads(table(runs, runs, "--format", "json"))
-    assert {e["n"] for e in document["entries"]} == {4}
+@pytest.mark.parametrize(
+    ("other", "name", "difference"),
+    [
+        ({"max_width": 160}, "width 160", "--max-width (1600, 160)"),
+        ({"scene_hash": "c" * 64}, "scene cccccc", "photos, poses or points (aaaaaa, cccccc)"),
+        (
+            {"scene_hash": "c" * 64, "split_hash": "d" * 64},
+            "split dddddd",
+            "test views (bbbbbb, dddddd)",
+        ),
+    ],
+)
+def test_what_cannot_be_compared_has_tables_of_its_own(tmp_path, other, name, difference):
+    write_scored(tmp_path / "a", "3dgs")
+    write_scored(tmp_path / "a", "4dgs")
+    write_scored(tmp_path / "b", "3dgs", psnr=((30.0, 31.0), (32.0, 33.0)), **other)
+    text = table(tmp_path / "a", tmp_path / "b")
+    assert f"plaza [{name}]: PSNR [dB] (psnr), higher is better" in text
+    assert f"plaza: runs with different {difference} cannot be compared, and stand apart" in text
+    assert "mean of scenes" not in text
+    document = json.loads(table(tmp_path / "a", tmp_path / "b", "--format", "json"))
+    compared = [e for e in document["entries"] if e["difference"] is not None]
+    assert {(e["method"], e["scene"].partition(" [")[0]) for e in compared} <= {
+        ("3dgs", "plaza"),
+        ("4dgs", "plaza"),
+    }
+    assert {e["scene"] for e in compared}.isdisjoint({f"plaza [{name}]"})
+
+
+def test_copies_count_once(tmp_path):
+    folder = write_scored(tmp_path / "runs")
+    copytree(tmp_path / "runs", tmp_path / "backup")
+    copytree(folder, folder.with_name("seed1"))
+    document = json.loads(table(tmp_path / "runs", tmp_path / "backup", "--format", "json"))
+    assert {e["n"] for e in document["entries"]} == {1}
+    (note,) = [note for note in document["notes"] if note.startswith("copies of runs, not counted")]
+    assert "seed1" in note and str(tmp_path / "backup") in note
+
+
+def test_a_seed_with_two_results_is_refused(tmp_path):
+    first, second = (write_scored(tmp_path / name, seconds=s) for name, s in (("a", 1), ("b", 2)))
+    with pytest.raises(ConfigError) as error:
+        table(tmp_path / "a", tmp_path / "b")
+    for text in (str(first), str(second), "plaza: 3dgs joint fast seed 0 once"):
+        assert text in str(error.value)
+
+
+def test_a_seed_of_two_commits_is_not_two_seeds(tmp_path):
+    write_scored(tmp_path / "a", commit="1" * 40)
+    write_scored(tmp_path / "b", commit="2" * 40 + "-dirty")
+    text = table(tmp_path / "a", tmp_path / "b")
+    assert "3DGS (joint, fast) [code 1111111111]" in text
+    assert "3DGS (joint, fast) [code 2222222222-dirty]" in text and "±" not in text
+
+
+@pytest.mark.parametrize(
+    ("claimed", "message"),
+    [
+        ("40.0", r"run.json: expected 23 as psnr, macro: the mean of rows.csv, found 40"),
+        ('"NaN"', r"not a number \(aggregates.macro.psnr\)"),
+    ],
+)
+def test_a_mean_that_is_not_that_of_the_views_is_refused(tmp_path, claimed, message):
+    file = write_scored(tmp_path / "runs") / "run.json"
+    text = file.read_text()
+    file.write_text(text.replace('"psnr": 23.0', f'"psnr": {claimed}', 1))
+    with pytest.raises(CheckpointError, match=message):
+        table(tmp_path / "runs")
+
+
+def test_times_of_two_devices_are_in_two_columns(tmp_path):
+    write_scored(tmp_path / "runs", "3dgs", seconds=7.0)
+    write_scored(tmp_path / "runs", "4dgs", seconds=9.0, device="cuda (Test)")
+    for i in (0, 1):
+        write_scored(tmp_path / "runs", "gs-w", i, seconds=8.0, device=f"device {i}")
+    lines = table(tmp_path / "runs", "--format", "markdown").splitlines()
+    start = lines.index(next(line for line in lines if "macro means and cost" in line))
+    head, _, *rows = [line.split(" | ") for line in lines[start:] if line.startswith("|")]
+    columns = [i for i, name in enumerate(head) if "training [s]" in name]
+    assert [head[i].split("] ")[1] for i in columns] == ["cpu (Test, 2 threads)", "cuda (Test)"]
+    assert [[row[i] for i in columns] for row in rows] == [["7.0", "-"], ["-", "9.0"], ["-", "-"]]
+    assert any("averaged, but for their times: GS-W (joint, fast)" in line for line in lines)
+
+
+def test_efforts_that_differ_are_noted(tmp_path):
+    for method, steps in (("3dgs", 100), ("4dgs", 2000)):
+        write_scored(tmp_path / "runs", method, iterations=steps)
+    said = "100 training steps: 3DGS (fast); 2,000 training steps: 4DGS (fast)"
+    assert f"efforts differ, and a difference may be theirs: {said}" in table(tmp_path / "runs")
+
+
+def test_names_and_columns_can_be_chosen(tmp_path):
+    for method, psnr in (("3dgs", 20.0), ("4dgs", 10.0)):
+        write_scored(tmp_path / "runs", method, psnr=((psnr, psnr),))
+    renames = ("--rename", " (joint, fast)=", "--rename", "3DGS=Ours")
+    columns = ("--columns", "macro,training")
+    text = table(tmp_path / "runs", "--format", "latex", *renames, *columns)
+    assert [line for line in text.splitlines() if line.endswith(r" \\")] == [
+        *(r"method & macro \\", r"Ours & \textbf{20.00} \\", r"4DGS & 10.00 \\"),
+        *(r"method & training [s] \\", r"Ours & 10.0 \\", r"4DGS & 10.0 \\"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--rename", "5DGS=x"), "--rename 5DGS=x: expected a part of names"),
+        (("--rename", "3DGS=4DGS"), "names that differ afterwards, too"),
+        (("--rename", "3DGS"), "--rename: expected OLD=NEW"),
+        (("--columns", "macros"), "--columns: expected one of .*macro"),
+        (("--columns", "macro", "--format", "csv"), "--columns: expected none with csv"),
+    ],
+)
+def test_names_and_columns_that_are_not_there_are_refused(tmp_path, option, message):
+    for method in ("3dgs", "4dgs"):
+        write_scored(tmp_path / "runs", method)
+    with pytest.raises(ConfigError, match=message):
+        table(tmp_path / "runs", *option)
 
 
 def test_a_region_has_tables_of_its_own(runs):

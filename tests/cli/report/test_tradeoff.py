@@ -87,13 +87,21 @@ def test_limits_give_one_sentence_and_nothing_else(runs):
         tradeoff(runs, "--budget", "2s", "--target-psnr", 24)
 
 
-def test_widths_that_differ_are_noted(runs, undrawn):
+def test_widths_are_not_compared(runs, undrawn):
     folder = runs / "plaza/quick-joint-fast/seed1"
     folder.mkdir()
     write_run(folder, record("quick", 1, psnr=(21.0,), max_width=800, render_seconds=0.1), [])
     text = tradeoff(runs).stdout
     assert "QUICK (joint, fast, max_width=800)" in text
-    assert "scored at several --max-width (800, 1600): smaller images are easier" in text
+    assert "plaza [width 800]: Pareto fronts" in text
+    assert "runs with different --max-width (1600, 800) cannot be compared" in text
+    assert "mean of scenes" not in text
+    chosen = tradeoff(runs, "--budget", "1m").stdout.splitlines()
+    assert [line.partition(",")[0] for line in chosen] == [
+        "plaza [width 1600]",
+        "plaza [width 800]",
+    ]
+    assert "--max-width" not in chosen[0] and chosen[1].endswith("--max-width 800")
 
 
 @pytest.mark.parametrize(("text", "size"), [("500kB", 5e5), ("10MB", 1e7), ("1.5 GB", 1.5e9)])

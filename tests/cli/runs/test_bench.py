@@ -206,6 +206,7 @@ def test_every_option_arrives(settings, tmp_path):
         (["--strategy", "both"], "expected one of joint, pooled, separate"),
         (["--budget", "5"], "--budget: expected a positive time"),
         (["--set", "x"], "--set: expected KEY=VALUE"),
+        (["--set", "x=1", "--set", "x=2"], "--set x: expected one value, found 1 and 2"),
         (["--method", "a,,b"], "--method: expected names separated by commas"),
     ],
 )

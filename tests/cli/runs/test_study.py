@@ -1,6 +1,11 @@
 """``chronoscene study`` from the outside: a study file, the table, the files."""
 
 import json
+from types import SimpleNamespace
+
+from click.testing import CliRunner
+
+from chronoscene.cli import cli
 
 from .test_bench import IMAGES, TESTS, chronoscene
 
@@ -34,6 +39,21 @@ def test_a_study_of_ones_own(make_scene_folder, tmp_path):
     assert rows == {"slow", "fast"}
     assert "| place | fast |" in (runs / "study-rates.md").read_text()
     assert (runs / "study-rates.csv").read_text().startswith("row,source,scene,")
+
+
+def test_budget_and_width_are_options(make_scene_folder, tmp_path, monkeypatch):
+    asked = []
+
+    def run(study, settings, log):
+        asked.append(settings.run)
+        return SimpleNamespace(finished=[], failures=[]), {}
+
+    monkeypatch.setattr("chronoscene.cli.runs.study.run_study", run)
+    (tmp_path / "rates.toml").write_text(STUDY)
+    scene = make_scene_folder(IMAGES)
+    call = ("study", tmp_path / "rates.toml", scene, "--budget", "1m", "--max-width", 320)
+    CliRunner().invoke(cli, [str(word) for word in call], catch_exceptions=False)
+    assert [(run.budget_seconds, run.max_width) for run in asked] == [(60.0, 320)]
 
 
 def test_mistakes_are_one_line(make_scene_folder, tmp_path):

@@ -134,6 +134,13 @@ def test_variants_are_named_by_what_differs_from_the_preset(changes, variant):
     assert method.run(job).job.variant == variant
 
 
+def test_a_budget_of_each_model_is_named_though_the_preset_has_it():
+    settings = replace(JOB.settings, overrides={}, iterations=None, budget_seconds=90.0)
+    job = replace(JOB, method="toy_methods:DATED", strategy="separate", settings=settings)
+    method = resolve_method(job.method, load_spec(job.method), settings)
+    assert method.run(job).job.variant == "budget=90s,separate_iterations=each"
+
+
 def test_the_command_names_what_differs_from_the_preset():
     variant = 'iterations=50,heads=["a", "b"],budget=90s,separate_iterations=each,max_width=800'
     config = {"method": "m", "strategy": "joint", "preset": "fast", "variant": variant}

@@ -147,9 +147,11 @@ def test_the_best_three_are_ranked_as_they_read():
 
 def test_seeds_of_several_devices_are_averaged():
     runs = [record(seed=i, psnr=(20.0 + i,), device=f"device {i}") for i in range(2)]
-    (found,) = summarise(runs, ["psnr"]).query("column == 'macro'").itertuples()
+    entries = summarise(runs)
+    (found,) = entries.query("column == 'macro'").itertuples()
     assert (found.mean, found.n, found.device) == (20.5, 2, "device 0; device 1")
     assert found.label == "CHRONOGS (joint, fast)"
+    assert not {"seconds", "render_seconds"} & {*entries.quantity}
 
 
 def test_the_same_seed_on_two_devices_compares_them():

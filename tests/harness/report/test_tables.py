@@ -354,7 +354,7 @@ def test_footnotes():
     assert not any("standard deviation" in note for note in notes(RUNS[:1], []))
     mixed = [record(seed=i, device=f"device {i}") for i in range(2)]
     assert "device: device 0; device 1" in notes(mixed, [])
-    averaged = "seeds of several devices are averaged, costs too: CHRONOGS (joint, fast)"
+    averaged = "seeds of several devices are averaged, but for their times: CHRONOGS (joint, fast)"
     assert averaged in notes(mixed, []) and averaged not in found
 
 

@@ -111,6 +111,22 @@ def test_the_configuration_for_limits(limits, method):
     assert sentence.endswith(f"bench DIR --method {method} --strategy joint --preset fast")
 
 
+def test_a_training_may_exceed_a_time_by_its_last_step():
+    slow = [run("m", 20.0, 90.0, iterations=2)]
+    assert "M (joint, fast)" in choose(slow, Limits(seconds=60.0), "--budget 1m")[0]
+    with pytest.raises(ConfigError, match="nearest: M"):
+        choose(slow, Limits(seconds=30.0), "--budget 30s")
+
+
+def test_what_reads_alike_is_chosen_by_the_rest():
+    runs = [run("dear", 20.001, 50.0), run("big", 20.0, 5.0, 2_000_000), run("small", 20.0, 5.0)]
+    assert "SMALL" in choose(runs, Limits(seconds=60.0), "--budget 1m")[0]
+    runs.append(run("better", 21.0, 5.01))
+    assert "BETTER" in choose(runs, Limits(psnr=19.0), "--target-psnr 19")[0]
+    with pytest.raises(ConfigError, match="nearest: BETTER"):  # a few ms further from the limit
+        choose(runs, Limits(seconds=4.0), "--budget 4s")
+
+
 def test_the_sentence_says_what_it_reaches_and_costs():
     seeds = [run("m", 20.0, 10.0), run("m", 22.0, 14.0, seed=1)]
     (sentence,) = choose(seeds, Limits(psnr=20.0), "--target-psnr 20")

@@ -3,7 +3,7 @@
 import pytest
 from made_runs import record
 
-from leaderboard.groups import comparable, effort_of
+from chronoscene.harness.report.comparable import apart, comparable, effort_of, several_scenes
 
 
 def test_methods_with_the_same_preset_are_compared():
@@ -42,10 +42,25 @@ def test_presets_of_one_length_are_compared_and_others_are_not():
     assert len(comparable(paper)) == 2
 
 
-def test_a_budget_for_each_model_is_another_effort():
-    total, each = "budget=90s", "budget=90s,separate_iterations=each"
-    runs = [record(strategy="separate", variant=variant) for variant in (total, each)]
-    assert len(comparable(runs)) == 2
+def test_a_budget_for_each_model_is_that_of_all_models():
+    each = record(strategy="separate", variant="budget=45s,separate_iterations=each")
+    assert effort_of(each) == effort_of(record(variant="budget=90s"))
+    pooled = record(strategy="pooled", variant="budget=45s,separate_iterations=each")
+    assert effort_of(pooled) == effort_of(record(variant="budget=45s"))
+    assert effort_of(record(variant="budget=1.2.3s")) == "100 training steps"
+
+
+def test_tests_of_one_scene_have_names_of_their_own():
+    runs = [record(), record("3dgs", max_width=800), record("3dgs", scene="quay", max_width=800)]
+    assert [run.scene for run in apart(runs)] == ["plaza [width 1600]", "plaza [width 800]", "quay"]
+    assert apart(runs[1:]) == runs[1:] and apart(apart(runs)) == apart(runs)
+    both = [record(), record(split_hash="0" * 8, max_width=800)]
+    assert apart(both)[1].scene == "plaza [width 800, split 000000]"
+
+
+def test_a_mean_over_scenes_needs_one_test_of_each():
+    assert several_scenes(["plaza", "quay [width 800]"]) and not several_scenes(["plaza"])
+    assert not several_scenes(["plaza [width 800]", "plaza [width 40]", "quay"])
 
 
 def test_an_option_of_a_method_is_no_effort():

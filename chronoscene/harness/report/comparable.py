@@ -1,0 +1,140 @@
+"""Definition of what may be compared, for tables, figures, trade-offs, studies, leaderboard.
+
+Scores are compared within a *test*: equal scene and photos, test views and width. Methods are
+ranked on the leaderboard if they had the same *effort* as well: the same time on the same device
+where there was a budget, else as many training steps, those of all models or stages together. A
+preset is no effort: those named ``paper`` have from 18,000 to 40,000 steps. Elsewhere efforts may
+differ, and notes say so. Times are compared on one device only (`TIMES` of `summary`). What a paper
+printed is in no test: its photos, test views and hardware are not known to be ours.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import RunRecord
+from chronoscene.io.wording import shown
+
+KEY = (
+    *("scene", "scene_hash", "split_hash", "method", "strategy", "preset", "variant"),
+    *("config_hash", "max_width", "device"),
+)
+"""Fields of `RunRecord` in which the seeds of a configuration agree on one device."""
+_FIELDS = {"width": "max_width", "split": "split_hash", "scene": "scene_hash"}
+_MEANING = {"width": "--max-width", "split": "test views", "scene": "photos, poses or points"}
+_APART = re.compile(rf" \[(?:{'|'.join(_FIELDS)}) [^]]*\]")
+
+
+class Setting(NamedTuple):
+    """Common properties of runs that are ranked together."""
+
+    scene: str
+    scene_hash: str
+    split_hash: str
+    max_width: int
+    effort: str
+
+    @property
+    def test(self) -> tuple[str | int, ...]:
+        """Everything but the effort: what scores have in common that may be compared."""
+        return self[:-1]
+
+
+def setting_of(run: RunRecord) -> Setting:
+    """Return the setting of a run."""
+    return Setting(run.scene, run.scene_hash, run.split_hash, run.max_width, effort_of(run))
+
+
+def effort_of(run: RunRecord) -> str:
+    """Describe the effort that a run was allowed, all models together."""
+    options = dict(part.partition("=")[::2] for part in run.variant.split(","))
+    if budget := re.fullmatch(r"(\d+(?:\.\d+)?(?:e\+\d+)?)s", options.get("budget", "")):
+        each = options.get("separate_iterations") == "each" and run.strategy != "pooled"
+        seconds = float(budget[1]) * (len(run.period_labels) if each else 1)
+        return f"{seconds:g}s of training on {run.device}"
+    if run.iterations is None:  # another program, which did not say
+        return f"preset {run.preset}"
+    return f"{run.iterations:,} training steps"
+
+
+def comparable(runs: Iterable[RunRecord]) -> dict[Setting, list[RunRecord]]:
+    """Group runs by their setting, those of a scene side by side."""
+    groups: dict[Setting, list[RunRecord]] = {}
+    for run in runs:
+        groups.setdefault(setting_of(run), []).append(run)
+    return dict(sorted(groups.items()))
+
+
+def apart(records: Sequence[RunRecord]) -> list[RunRecord]:
+    """Give each test of a scene a name of its own where there are several, and a notice.
+
+    Tables, figures and means go by the name of the scene.
+    """
+    tests: dict[str, dict[tuple[str | int, ...], RunRecord]] = {}
+    for run in records:
+        tests.setdefault(run.scene, {}).setdefault(setting_of(run).test, run)
+    changes: dict[tuple[str | int, ...], dict[str, str]] = {}
+    for scene, of_scene in tests.items():
+        if len(of_scene) == 1:
+            continue
+        names = [
+            {kind: str(getattr(run, field))[:6] for kind, field in _FIELDS.items()}
+            for run in of_scene.values()
+        ]
+        differing = [kind for kind in ("width", "split") if len({n[kind] for n in names}) > 1]
+        if len({tuple(n[kind] for kind in differing) for n in names}) < len(names):
+            differing.append("scene")  # its hash covers the split, too
+        values = {kind: ", ".join(dict.fromkeys(n[kind] for n in names)) for kind in differing}
+        what = "; ".join(f"{_MEANING[kind]} ({text})" for kind, text in values.items())
+        notice = f"{scene}: runs with different {what} cannot be compared, and stand apart"
+        for test, n in zip(of_scene, names, strict=True):
+            name = f"{scene} [{', '.join(f'{kind} {n[kind]}' for kind in differing)}]"
+            changes[test] = {"scene": name, "notice": notice}
+    found = []
+    for run in records:
+        if change := changes.get(setting_of(run).test):
+            notices = [*run.notices, change["notice"]]
+            run = run.model_copy(update={"scene": change["scene"], "notices": notices})
+        found.append(run)
+    return found
+
+
+def several_scenes(names: Iterable[str]) -> bool:
+    """Return True if a mean over scenes says something: of several, with one test of each.
+
+    Args:
+        names: As `apart` gives them.
+    """
+    tests = {*names}
+    return len(tests) > 1 and len({_APART.sub("", name) for name in tests}) == len(tests)
+
+
+def each_once(records: Iterable[RunRecord]) -> list[RunRecord]:
+    """Leave copies of runs out, with a notice.
+
+    Raises:
+        ConfigError: If two runs of one seed, configuration, device and commit are no copies.
+    """
+    found: dict[tuple[object, ...], RunRecord] = {}
+    fields = (*KEY, "seed", "commit")
+    copies = []
+    for run in records:
+        first = found.setdefault(tuple(getattr(run, name) for name in fields), run)
+        if first is run:
+            continue
+        if first != run.model_copy(update={"folder": first.folder}):
+            raise ConfigError(
+                run.folder,
+                expected=f"{run.label} once",
+                found=f"it also, with other values, in {first.folder}",
+                todo="leave out the folder of one of the two",
+            )
+        copies.append(str(run.folder))
+    runs = [*found.values()]
+    if copies:
+        notice = f"copies of runs, not counted: {shown(copies)}"
+        runs[0] = runs[0].model_copy(update={"notices": [*runs[0].notices, notice]})
+    return runs
