@@ -26,7 +26,7 @@ class Curves(NamedTuple):
     """Colour and line style of each method."""
 
 
-def draw_curves(records: Sequence[RunRecord]) -> Curves | None:
+def draw_curves(records: Sequence[RunRecord]) -> list[Curves]:
     """Draw PSNR of the probe views against seconds of training, from ``curve.csv`` of some runs.
 
     A run has a line for each of its models, whose seconds are its own.
@@ -35,10 +35,16 @@ def draw_curves(records: Sequence[RunRecord]) -> Curves | None:
         records: Runs on one scene, as from `chronoscene.harness.report.summary.read_runs`.
 
     Returns:
-        None if nothing was probed.
+        A plot for each device on which something was probed.
     """
+    devices = dict.fromkeys(run.device for run in records)
+    plots = [_draw([run for run in records if run.device == d], d) for d in devices]
+    return [plot for plot in plots if plot is not None]
+
+
+def _draw(records: Sequence[RunRecord], device: str) -> Curves | None:
     figure = canvas.new_figure(*SIZE, layout="constrained")
-    axes = figure.add_subplot(xlabel="training [s]", ylabel="PSNR [dB]")
+    axes = figure.add_subplot(xlabel=f"training [s] on {canvas.plain(device)}", ylabel="PSNR [dB]")
     canvas.quiet_axes(axes)
     axes.grid(axis="y", color=canvas.GRID, linewidth=0.6)
     methods = list(dict.fromkeys(record.method for record in records))
