@@ -21,6 +21,7 @@ from chronoscene.harness.report.comparable import KEY
 from chronoscene.harness.report.summary import COSTS
 from chronoscene.harness.score.regions import ALL
 from chronoscene.harness.score.scoring import aggregate
+from chronoscene.io.documents import plain_file
 from chronoscene.io.staging import leads_out
 from chronoscene.metrics.registry import all_metrics
 
@@ -142,7 +143,7 @@ def read_entry(path: Path) -> MeasuredEntry:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise refused(path, f"more than {MAX_BYTES} bytes")
-        return MeasuredEntry.model_validate_json(path.read_bytes())
+        return MeasuredEntry.model_validate_json(plain_file(path).read_bytes())
     except ValidationError as error:
         raise refused(path, reason_of(error)) from error
     except OSError as error:

@@ -11,6 +11,7 @@ from chronoscene import __version__
 from chronoscene.errors import ChronoSceneError
 from chronoscene.io.processes import stoppable
 from chronoscene.io.staging import disk_full
+from chronoscene.io.wording import printable_lines
 
 COMMANDS = {
     "bench": "chronoscene.cli.runs.bench:command",
@@ -90,5 +91,5 @@ def main() -> None:
 
 
 def _end(message: str) -> None:
-    click.secho(f"error: {message}", fg="red", err=True)
+    click.secho(f"error: {printable_lines(message)}", fg="red", err=True)
     sys.exit(USAGE_ERROR)

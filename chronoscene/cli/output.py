@@ -10,13 +10,14 @@ from os import strerror
 from pathlib import Path
 from shutil import get_terminal_size
 from tempfile import TemporaryFile
+from typing import Any
 
 import click
 
 from chronoscene.errors import ConfigError
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import FORMATS
-from chronoscene.io.wording import printable
+from chronoscene.io.wording import printable, printable_lines
 
 A_FILE = "a file that can be written"
 FORMAT = click.option(
@@ -30,7 +31,7 @@ OUT_FILE = click.option(
 def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
     """Print a text, or write it to a file without colours.
 
-    Characters that the terminal lacks are printed as escape sequences.
+    Characters that the terminal lacks, or that could disturb it, are printed as escape sequences.
 
     Args:
         text: With the end of its last line.
@@ -42,12 +43,18 @@ def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
     """
     if out is None:
         encoding = sys.stdout.encoding or "utf-8"
+        text = printable_lines(text)
         click.echo(text.encode(encoding, "backslashreplace").decode(encoding), nl=False)
         return
     whole = click.unstyle(text).encode("utf-8", "backslashreplace").decode()  # names may be bytes
     with writing_to(option, out, expected=A_FILE):
         write_text_atomic(out, whole)
     report_written(out)
+
+
+def say(line: str, **style: Any) -> None:
+    """Print a line to standard error, in the style of `click.style`; names in it are only text."""
+    click.secho(printable(line), err=True, reset=bool(style), **style)
 
 
 def terminal_width(out: Path | None) -> int | None:
@@ -58,7 +65,7 @@ def terminal_width(out: Path | None) -> int | None:
 def report_written(*places: Path) -> None:
     """Print the names of written files to standard error: standard output is for results."""
     for place in places:
-        click.echo(printable(f"wrote {place}"), err=True)
+        say(f"wrote {place}")
 
 
 @contextmanager

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TypeVar
 
-import click
-
+from chronoscene.cli.output import say
 from chronoscene.io.processes import Report
+from chronoscene.io.wording import printable
 
 T = TypeVar("T")
 BAR_WIDTH = 20
@@ -46,7 +46,7 @@ def progress_bar(first: str = "") -> Iterator[Report]:
 
 def announce(step: str) -> None:
     """Print the name of a step whose progress cannot be counted."""
-    click.echo(step, err=True)
+    say(step)
 
 
 def tracked(items: Iterable[T], what: str, *, total: int | None = None) -> Iterator[T]:
@@ -95,7 +95,7 @@ def _bar(first: str = "") -> Iterator[Report]:
         bar = progress.add_task(first, total=None, rate="")
 
         def report(what: str, done: int, total: int) -> None:
-            task = progress.tasks[0]
+            task, what = progress.tasks[0], printable(what)
             counts_on = task.total == total and done > task.completed  # under another name
             if what != task.description and not counts_on:
                 progress.reset(bar, total=total, completed=done, description=what, rate="")
@@ -112,7 +112,7 @@ def _print_steps() -> Report:
         nonlocal last, printed
         now = time.monotonic()
         if what != last or (now - printed >= BETWEEN_LINES and done < total):
-            click.echo(f"{what}: {done} of {total}" if total > 1 else what, err=True)
+            say(f"{what}: {done} of {total}" if total > 1 else what)
             last, printed = what, now
 
     return report

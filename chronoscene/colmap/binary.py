@@ -37,6 +37,7 @@ from chronoscene.colmap.raw_model import (
     Sensor,
 )
 from chronoscene.errors import SceneError
+from chronoscene.io.documents import plain_file
 from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES, Camera
 
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])  # A keypoint of an image
@@ -198,7 +199,7 @@ class _Reader:
 def _records_of(path: Path) -> Iterator[_Reader]:
     """Open a file to read its records; errors name the path."""
     try:
-        yield _Reader(path.read_bytes())
+        yield _Reader(plain_file(path).read_bytes())
         return
     except OSError as error:
         found = error.strerror or "unreadable"

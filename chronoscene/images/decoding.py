@@ -18,6 +18,7 @@ from PIL import ExifTags, Image
 
 from chronoscene.errors import ImageError
 from chronoscene.images.masks import MODES, resize_mask
+from chronoscene.io.documents import plain_file
 
 _UNDO_ORIENTATION = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -58,7 +59,7 @@ def image_size(path: Path) -> tuple[int, int]:
         ImageError: If the file is missing or not an image.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(plain_file(path)) as image:
             width, height = image.size
             turned = image.format == "TIFF" and _orientation(image) >= 5
             return (height, width) if turned else (width, height)
@@ -91,7 +92,7 @@ def load_photo(
             or the mask not of one channel, or not of the size of the image.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(plain_file(path)) as image:
             decoded = _decode(image)
             rgb, mask = _to_rgb(decoded), _opaque(decoded)
     except _DECODE_ERRORS as error:
@@ -117,7 +118,7 @@ def load_grey(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
         ImageError: If it is missing, damaged, not of one channel, or of another width and height.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(plain_file(path)) as image:
             found = f"{image.width} x {image.height} pixels of mode {image.mode}"
             if image.size == size and image.mode in MODES:
                 return np.asarray(image, np.uint8)

@@ -23,6 +23,8 @@ from typing import Any, TypeVar
 from PIL import ExifTags, Image
 from PIL.ExifTags import GPS, Base
 
+from chronoscene.io.documents import plain_file
+
 Number = TypeVar("Number", int, float)
 
 _EXIF, _APP1, _START_OF_SCAN = b"Exif\0\0", 0xE1, 0xDA
@@ -81,7 +83,7 @@ def read_exif(path: Path) -> ExifData:
     """Read the metadata of a photo; empty for a file that is not an image. Never raises."""
     with suppress(Exception), warnings.catch_warnings():  # Pillow raises almost anything
         warnings.simplefilter("ignore")
-        with Image.open(path) as image:
+        with Image.open(plain_file(path)) as image:
             return exif_of(image)
     return ExifData()
 

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
+import stat
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from chronoscene.errors import ChronoSceneError, SceneError
+
+
+def plain_file(path: Path) -> Path:
+    """Return the path of a file that can be read to its end: of pipes and devices, none is known.
+
+    Raises:
+        OSError: If it is such a one, or missing.
+    """
+    kind = path.stat().st_mode
+    if stat.S_ISREG(kind) or stat.S_ISDIR(kind):  # opening a folder says what is wrong
+        return path
+    raise OSError(errno.EINVAL, "a pipe or device, not a file", str(path))
 
 
 def read_text(path: Path, *, error: type[ChronoSceneError] = SceneError) -> str:
@@ -23,7 +37,7 @@ def read_text(path: Path, *, error: type[ChronoSceneError] = SceneError) -> str:
         ChronoSceneError: If it is missing or not text.
     """
     try:
-        return decode_text(path.read_bytes())
+        return decode_text(plain_file(path).read_bytes())
     except UnicodeDecodeError:
         found, todo = "bytes that are not UTF-8", "save it as UTF-8"
     except FileNotFoundError:

@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path, PureWindowsPath
 
 from chronoscene.errors import ConfigError, DiskFullError, SceneError
+from chronoscene.io.documents import plain_file
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # Linux: another one after each start of the machine
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}  # Windows has no quotas of this kind
@@ -34,7 +35,7 @@ def disk_full(error: OSError, place: object) -> DiskFullError | None:
 
 def sha256_of(path: Path) -> str:
     """Hash the content of a file (SHA-256, in hexadecimal)."""
-    with path.open("rb") as file:
+    with plain_file(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
+_LINES_AND_COLOURS = re.compile(r"(\n|\x1b\[(?:0|1|3\d|9\d)m)")
 MAX_NAME_LENGTH = 120  # Characters of a name from a file that a message repeats
 
 
@@ -12,6 +14,12 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def printable_lines(text: str) -> str:
+    """Escape as `printable` does, but keep the ends of lines and colours as click sets them."""
+    parts = _LINES_AND_COLOURS.split(text)
+    return "".join(part if i % 2 else printable(part) for i, part in enumerate(parts))
 
 
 def quote(text: str) -> str:

@@ -14,6 +14,7 @@ from chronoscene.cli.output import (
     check_file,
     emit,
     report_written,
+    say,
     terminal_width,
     writing_to,
 )
@@ -99,7 +100,7 @@ def command(
         width = terminal_width(out)
         emit("\n".join(boxed_text(table, width=width) for table in worst), out)
     for name in sorted({run.scene for run in records} - by_scene(records).keys()):
-        click.echo(f"{name}: no pictures, as its runs are not of the frozen photos", err=True)
+        say(f"{name}: no pictures, as its runs are not of the frozen photos")
     with writing_to("RUNS", runs):
         report_written(*draw_figures(runs, records, views_per_period=views))
     if html is not None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import EXISTING_FOLDER, LPIPS_WEIGHTS, RUNS, split_list
-from chronoscene.cli.output import FORMAT, OUT_FILE, emit, terminal_width
+from chronoscene.cli.output import FORMAT, OUT_FILE, emit, say, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RESULTS_FILE, ROWS_FILE
@@ -60,11 +60,11 @@ def score(
     for outcome in outcomes:
         name = outcome.folder.relative_to(runs)
         if outcome.error is not None:
-            click.secho(f"{name}: error: {outcome.error}", fg="red", err=True)
+            say(f"{name}: error: {outcome.error}", fg="red")
             continue
-        click.echo(f"{name}: {'; '.join(outcome.changes) or 'unchanged'}")
+        emit(f"{name}: {'; '.join(outcome.changes) or 'unchanged'}\n", None)
         for metric in outcome.kept:
-            click.echo(f"{name}: {metric} kept from an earlier scoring")
+            emit(f"{name}: {metric} kept from an earlier scoring\n", None)
     for reason in dict.fromkeys(scorers.skipped.values()):
         names = ", ".join(name for name, why in scorers.skipped.items() if why == reason)
         click.echo(f"{names} not computed: {reason}")
@@ -79,7 +79,7 @@ def print_runs(out: Path) -> None:
     emit(text + "\n", None)
     drawers = (draw_figures, draw_stages, draw_sharing)
     figures = [path for draw in drawers for path in draw(out, records)]
-    click.echo("\n".join(map(str, (out / RESULTS_FILE, out / ROWS_FILE, *figures))))
+    emit("".join(f"{path}\n" for path in (out / RESULTS_FILE, out / ROWS_FILE, *figures)), None)
 
 
 @click.command("table")

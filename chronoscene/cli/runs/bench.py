@@ -18,7 +18,7 @@ from chronoscene.cli.options import (
     split_list,
     training_options,
 )
-from chronoscene.cli.output import check_place
+from chronoscene.cli.output import check_place, say
 from chronoscene.cli.report.results import print_runs
 from chronoscene.formats import find_scenes, nearby_scenes
 from chronoscene.harness.files.records import read_failures
@@ -131,7 +131,7 @@ def command(methods: str, strategies: str, seeds: int, seed: int, **options: Any
         seeds=tuple(range(seed, seed + seeds)),
         **options,
     )
-    outcome = run_bench(settings, lambda line: click.echo(line, err=True))
+    outcome = run_bench(settings, say)
     report(outcome, settings.run.runs)
 
 
@@ -178,6 +178,6 @@ def report(outcome: BenchOutcome, out: Path) -> None:
         print_runs(out)
     else:
         for failure in read_failures(out):
-            click.echo(f"failed: {failure.scene}, {failure.method}: {failure.reason}", err=True)
+            say(f"failed: {failure.scene}, {failure.method}: {failure.reason}")
     if outcome.failures:
         click.get_current_context().exit(SOME_FAILED)

@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE
-from chronoscene.cli.output import emit, report_written, terminal_width
+from chronoscene.cli.output import emit, report_written, say, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
 from chronoscene.figures.canvas import rgb_of
@@ -80,14 +80,15 @@ def command(
     emit(boxed_text(table, width=terminal_width(None)), None)
     if (sharing := run.record.sharing) is not None:
         unit, count = run.record.primitive, sum(sharing.blocks)
-        click.echo(
+        emit(
             f"the model has one block of features for all periods in "
             f"{100 * sharing.invariant_share:.1f} % of its {count:,} {unit}, and "
-            f"{sharing.mean_blocks:.2f} of {len(sharing.blocks)} on average"
+            f"{sharing.mean_blocks:.2f} of {len(sharing.blocks)} on average\n",
+            None,
         )
     report_written(out)
     if not any(scores for _, scores in maps):
-        click.echo(f"not scored: no change masks of test views in {found.root / 'gt'}", err=True)
+        say(f"not scored: no change masks of test views in {found.root / 'gt'}")
 
 
 def usual_pairs(periods: int) -> list[tuple[int, int]]:

@@ -14,7 +14,7 @@ from chronoscene.cli.options import (
     reading_options,
     training_options,
 )
-from chronoscene.cli.output import emit, terminal_width
+from chronoscene.cli.output import emit, say, terminal_width
 from chronoscene.cli.runs.bench import BUDGET, SOME_FAILED, WIDTH, settings_from
 from chronoscene.harness.study.plan import find_study, read_study, run_study
 from chronoscene.harness.study.tables import study_texts
@@ -43,7 +43,7 @@ def command(name: str, seeds: int, **options: Any) -> None:
     study = read_study(file)
     look_here_for([study.method, *(row.method for row in study.rows)])
     settings = settings_from(methods=(), seeds=tuple(range(seeds)), **options)
-    outcome, finished = run_study(study, settings, lambda line: click.echo(line, err=True))
+    outcome, finished = run_study(study, settings, say)
     if outcome.finished:
         texts = study_texts(study, finished, outcome.failures, width=terminal_width(None))
         emit(texts["table"], None)
@@ -51,6 +51,6 @@ def command(name: str, seeds: int, **options: Any) -> None:
             emit(texts[style], settings.run.runs / f"study-{file.stem}.{ending}")
     else:
         for failure in outcome.failures:
-            click.echo(f"failed: {failure.scene}, {failure.method}: {failure.reason}", err=True)
+            say(f"failed: {failure.scene}, {failure.method}: {failure.reason}")
     if outcome.failures:
         click.get_current_context().exit(SOME_FAILED)

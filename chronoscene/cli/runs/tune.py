@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from chronoscene.cli.options import FOLDER, SCENES, add_options, look_here_for, reading_options
-from chronoscene.cli.output import emit, report_written, terminal_width
+from chronoscene.cli.output import emit, report_written, say, terminal_width
 from chronoscene.cli.runs.bench import settings_from
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.tune.report import PRESET_FILE, TRIALS_FILE, trials_table
@@ -44,6 +44,6 @@ def command(method: str, trials: int, seed: int, strategy: str, out: Path, **opt
     settings = settings_from(
         methods=(method,), strategies=(strategy,), seeds=(seed,), out=out, assignments=(), **options
     )
-    results = tune(settings, trials, lambda line: click.echo(line, err=True))
+    results = tune(settings, trials, say)
     emit(boxed_text(trials_table(results), width=terminal_width(None)), None)
     report_written(out / PRESET_FILE, out / TRIALS_FILE)

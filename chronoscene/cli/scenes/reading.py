@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
-
+from chronoscene.cli.output import say
 from chronoscene.formats import detect
 from chronoscene.images.store import ImageSource
 from chronoscene.scene import Scene
@@ -24,7 +23,7 @@ def read_and_note(source: Path, dataset_format: str | None, period_by: str | Non
 
 def show_note(note: str) -> None:
     """Print one line on standard error."""
-    click.secho(f"note: {note}", fg="yellow", err=True)
+    say(f"note: {note}", fg="yellow")
 
 
 def describe(scene: Scene) -> str:

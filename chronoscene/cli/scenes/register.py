@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from chronoscene.cli.options import EXISTING_FILE, PATH
-from chronoscene.cli.output import check_place, emit
+from chronoscene.cli.output import check_place, emit, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
@@ -148,7 +148,7 @@ def command(
             )
     except BaseException as error:
         for note in getattr(error, "__notes__", ()):
-            click.echo(f"note: {note}", err=True)
+            say(f"note: {note}")
         raise
     emit(summary(registered, out) + "".join(i.summary for i in inspections), None)
     if any(i.verdict.level == "fail" for i in inspections):

@@ -18,6 +18,7 @@ from chronoscene.cli.output import (
     check_place,
     emit,
     report_written,
+    say,
     terminal_width,
     writing_to,
 )
@@ -26,7 +27,6 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import detect, find_scenes, nearby_scenes, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
-from chronoscene.io.wording import printable
 from chronoscene.kernels.runtime import keep_freed_memory
 from chronoscene.statistics.counts import (
     COUNT_RULES,
@@ -161,9 +161,9 @@ def command(
         report_written(*written)
     notes = (f"{s.name}: {n}" for s in counts for n in detect(Path(s.path), format=s.format).notes)
     for remark in [*notes, *unseen(counts), *against_paper(counts)]:
-        click.echo(printable(remark), err=True)
+        say(remark)
     for scene in unreadable:
-        click.secho(printable(f"error: {scene.error}"), fg="red", err=True)
+        say(f"error: {scene.error}", fg="red")
     if unreadable:
         context.exit(SOME_FAILED if counts else ALL_FAILED)
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import PATH, reading_options
-from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit
+from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit, say
 from chronoscene.cli.progress import announce, tracked
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
-from chronoscene.io.wording import counted, printable
+from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import keep_freed_memory
 from chronoscene.validation.folder.scene_folder import Track, no_progress
 from chronoscene.validation.repair.fix import fix_scene
@@ -150,9 +150,9 @@ def _fix(folder: Path, scenes: Sequence[Path], out: Path, options: ReadOptions) 
         copy = out if scene == folder else out / scene.name
         announce(f"correct {scene}")
         repairs = fix_scene(scene, copy, options)
-        click.echo(printable(f"{copy}: {counted(len(repairs), 'correction')}"), err=True)
+        say(f"{copy}: {counted(len(repairs), 'correction')}")
         for repair in repairs:
-            click.echo(printable(f"  {repair.code or 'also'}: {repair.text}"), err=True)
+            say(f"  {repair.code or 'also'}: {repair.text}")
         copies.append(copy)
     return copies
 

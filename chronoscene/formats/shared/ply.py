@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from chronoscene.errors import SceneError
+from chronoscene.io.documents import plain_file
 from chronoscene.scene import Points
 
 MAX_HEADER_BYTES = 100_000
@@ -32,7 +33,7 @@ def read_points(path: Path) -> Points:
         SceneError: If the file is missing, damaged, or not a cloud of finite points.
     """
     try:
-        with path.open("rb") as file:
+        with plain_file(path).open("rb") as file:
             vertices = _read_vertices(path, file)
     except OSError as error:
         raise _error(path, "a PLY file", error.strerror or "an error") from error
@@ -46,7 +47,7 @@ def count_vertices(path: Path) -> int:
         SceneError: If it is no such file.
     """
     try:
-        with path.open("rb") as file:
+        with plain_file(path).open("rb") as file:
             return _read_header(path, file)[1]
     except OSError as error:
         raise _error(path, "a PLY file", error.strerror or "an error") from error

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from chronoscene.errors import CheckpointError
-from chronoscene.io.documents import read_json_document
+from chronoscene.io.documents import plain_file, read_json_document
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.methods import PeriodSharing
@@ -260,7 +260,7 @@ def read_lines(path: Path, kind: type[Line], *, expected: str) -> list[Line]:
     types = {"str": str, "int": int, "float": float}
     columns = [(field.name, types[str(field.type)]) for field in fields(kind)]
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with plain_file(path).open(encoding="utf-8", newline="") as file:
             lines = csv.DictReader(file)
             return [kind(*[convert(line[name]) for name, convert in columns]) for line in lines]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
@@ -291,9 +291,11 @@ def read_document(
         CheckpointError: If it is missing or damaged.
     """
     try:
-        return kind.model_validate_json(path.read_bytes())
+        return kind.model_validate_json(plain_file(path).read_bytes())
     except FileNotFoundError as error:
         raise CheckpointError(path, expected=expected, found=found, todo=todo) from error
+    except OSError as error:
+        raise damaged(path, error.strerror or str(error)) from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"

@@ -11,6 +11,7 @@ from PIL import Image
 
 from chronoscene.images.exif import ExifData, read_exif, taken_at
 from chronoscene.images.masks import find_masks
+from chronoscene.io.documents import plain_file
 
 GPS_SIGMA = (5.0, 5.0, 10.0)
 """Metres east, north, up, if the photo states none: a consumer receiver under open sky."""
@@ -56,7 +57,7 @@ class Capture:
 def open_photo(path: Path, name: str, period: int) -> Capture | str:
     """Read a capture; the reason if it is unusable. All files are decoded: many are truncated."""
     try:
-        with Image.open(path) as image:
+        with Image.open(plain_file(path)) as image:
             width, height = image.size
             # A JPEG is then read to its end, but decoded at a reduced size.
             image.draft("RGB", (width // 8, height // 8))
