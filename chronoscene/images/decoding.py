@@ -72,6 +72,24 @@ def load_rgb(path: Path, *, size: tuple[int, int] | None = None) -> NDArray[np.u
     return load_photo(path, size=size)[0]
 
 
+def load_opaque(path: Path, *, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """Decode an image as `load_rgb` does, if alpha is 255 everywhere. [H, W, 3]
+
+    Raises:
+        ImageError: As for `load_photo`, and if any pixel is transparent, if only a little.
+    """
+    pixels = load_rgb(path, size=size)
+    with Image.open(path) as image:
+        if is_transparent(image) and image.convert("RGBA").getextrema()[3][0] < 255:
+            raise ImageError(
+                path,
+                expected="an image without transparent pixels",
+                found="an alpha channel below 255",
+                todo="render it over the background that the photos show, and save it as RGB",
+            )
+    return pixels
+
+
 def load_photo(
     path: Path, mask_path: Path | None = None, *, size: tuple[int, int] | None = None
 ) -> Photo:
