@@ -25,7 +25,7 @@ COLORS: Mapping[str, str] = {
 """Colours of the classes of places, which are numbered in this order."""
 FAINT = 2  # Classes that the others are drawn over
 WIDTH, GAP = 3.4, 0.15  # Of a panel, and between panels, in inches
-LEFT, RIGHT, BOTTOM, TOP, TITLE = 0.62, 0.15, 0.5, 0.62, 0.26
+LEFT, RIGHT, BOTTOM, TOP, TITLE, LINE = 0.62, 0.15, 0.5, 0.62, 0.26, 0.22
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +53,8 @@ def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path) -> Non
     size = (WIDTH, WIDTH * box.edges[1] / box.edges[0])
     step = (WIDTH + GAP, size[1] + TITLE + GAP)
     width = LEFT + columns * step[0] - GAP + RIGHT
-    height = BOTTOM + rows * step[1] - GAP - TITLE + TOP
+    lines = 2 if columns == 1 else 1  # of the legend
+    height = BOTTOM + rows * step[1] - GAP - TITLE + TOP + (lines - 1) * LINE
     figure = canvas.new_figure(width, height)
     colors = list(COLORS.values())
     for number, panel in enumerate(panels):
@@ -72,7 +73,8 @@ def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path) -> Non
         axes.set_title(canvas.plain(panel.title), fontsize=9, pad=4)
     corner = (LEFT / width, 1 - 0.1 / height)
     entries = list(COLORS.items())
+    in_line = math.ceil(len(entries) / lines)
     canvas.add_legend(
-        figure, entries, len(entries), loc="upper left", bbox_to_anchor=corner, borderpad=0
+        figure, entries, in_line, loc="upper left", bbox_to_anchor=corner, borderpad=0
     )
     canvas.save(figure, path)

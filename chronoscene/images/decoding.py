@@ -60,9 +60,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     try:
         with Image.open(plain_file(path)) as image:
-            width, height = image.size
-            turned = image.format == "TIFF" and _orientation(image) >= 5
-            return (height, width) if turned else (width, height)
+            return stored_size(image)
     except _DECODE_ERRORS as error:
         raise _image_error(path, error) from error
 
@@ -70,6 +68,24 @@ def image_size(path: Path) -> tuple[int, int]:
 def load_rgb(path: Path, *, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
     """Decode any image to RGB; arguments and errors as for `load_photo`. [H, W, 3]"""
     return load_photo(path, size=size)[0]
+
+
+def load_opaque(path: Path, *, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """Decode an image as `load_rgb` does, if alpha is 255 everywhere. [H, W, 3]
+
+    Raises:
+        ImageError: As for `load_photo`, and if any pixel is transparent, if only a little.
+    """
+    pixels = load_rgb(path, size=size)
+    with Image.open(path) as image:
+        if is_transparent(image) and image.convert("RGBA").getextrema()[3][0] < 255:
+            raise ImageError(
+                path,
+                expected="an image without transparent pixels",
+                found="an alpha channel below 255",
+                todo="render it over the background that the photos show, and save it as RGB",
+            )
+    return pixels
 
 
 def load_photo(
@@ -137,8 +153,29 @@ def _orientation(image: Image.Image) -> int:
     return value if value in _UNDO_ORIENTATION else 1
 
 
+def stored_size(image: Image.Image) -> tuple[int, int]:
+    """Return width and height of the pixels as stored: Pillow's size of a TIFF is after rotation."""
+    width, height = image.size
+    turned = image.format == "TIFF" and _orientation(image) >= 5
+    return (height, width) if turned else (width, height)
+
+
+def is_covered(image: Image.Image) -> bool:
+    """Return False for a TIFF file with rows or columns that no strip or tile has.
+
+    Pillow leaves them black, however many are announced.
+    """
+    if image.format != "TIFF":
+        return True
+    width, height = stored_size(image)
+    ends = [box[2:] for _, box, *_ in getattr(image, "tile", ())]
+    return any(x >= width for x, _ in ends) and any(y >= height for _, y in ends)
+
+
 def _decode(image: Image.Image) -> Image.Image:
     """Decode the pixels as stored; the rotation of TIFF files by Pillow is undone."""
+    if not is_covered(image):
+        raise ValueError(f"no data for all of its {image.width} x {image.height} pixels")
     orientation = _orientation(image) if image.format == "TIFF" else 1
     image.load()
     if orientation == 1:

@@ -262,7 +262,8 @@ def map_parallel(
     Args:
         function: At the top level of a module, or a ``partial`` of such a function.
         items: Its arguments.
-        workers: Processes; None for one per processor. With one, or one item, none is started.
+        workers: Processes; None for one per processor. One item is not worth a process, and one
+            worker is none where nothing can be ``lost``.
         lost: The result for an item whose process died; None to raise an error.
 
     Raises:
@@ -271,7 +272,7 @@ def map_parallel(
     from concurrent.futures.process import BrokenProcessPool
 
     workers = min(workers or available_threads(), len(items))
-    if workers <= 1:
+    if len(items) <= 1 or (workers == 1 and lost is None):
         yield from map(function, items)
         return
     done = 0

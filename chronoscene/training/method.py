@@ -7,7 +7,7 @@ trainer that changes its tensors.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -20,7 +20,13 @@ from chronoscene.errors import CheckpointError, ShapeError
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
-from chronoscene.training.checkpoint import TRAINING, TrainingState, load_tensors, save_tensors
+from chronoscene.training.checkpoint import (
+    DAMAGED,
+    TRAINING,
+    TrainingState,
+    load_tensors,
+    save_tensors,
+)
 from chronoscene.training.config import SplattingConfig
 from chronoscene.training.drawing import Splats, camera_centre_tensor, prediction_of
 from chronoscene.training.exposure import Exposure, exposed, of_period
@@ -175,9 +181,18 @@ class SplattingMethod(ABC):
     def load(self, folder: Path, *, device: str) -> None:
         """Read a model; what is stored with it takes precedence over the options given here."""
         tensors, self.meta = load_tensors(folder, device=device, method=self.name)
-        self.background = torch.tensor(self.meta["background"], dtype=torch.float32, device=device)
-        self._exposure = tensors.pop(_EXPOSURE, None)
-        self.restore(folder, tensors, device)
+        _check_finite(folder, tensors)
+        try:
+            background = torch.tensor(self.meta["background"], dtype=torch.float32, device=device)
+            self.background, self._exposure = background, tensors.pop(_EXPOSURE, None)
+            self.restore(folder, tensors, device)
+        except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise CheckpointError(
+                folder,
+                expected="tensors and a description that fit together",
+                found=f"{type(error).__name__}: {error}",
+                todo=DAMAGED,
+            ) from error
         self.trainer = None
 
     def save_training(self, folder: Path) -> None:
@@ -205,3 +220,15 @@ class SplattingMethod(ABC):
         count, parameters = len(tensors[self.primitive]), sum(t.numel() for t in tensors.values())
         unit = "anchors" if self.primitive == "anchors" else "Gaussians"
         return MethodSize(count, parameters, unit)
+
+
+def _check_finite(folder: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse models with numbers that are not finite: their pictures would be wrong silently."""
+    wrong = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
+    if wrong:
+        raise CheckpointError(
+            folder,
+            expected="finite numbers in all tensors of the model",
+            found=f"others in {', '.join(wrong)}",
+            todo=f"{DAMAGED}, with lower learning rates if the training gave it",
+        )

@@ -22,6 +22,7 @@ from chronoscene.harness.train.checks import check_sharing
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet
 from chronoscene.scene.similarity import Sim3
+from chronoscene.training.checkpoint import save_tensors
 from chronoscene.training.schedules import log_linear
 
 Make = Callable[..., ChronoGS]
@@ -343,6 +344,10 @@ def test_what_carries_nothing_is_dropped_once_growth_is_over(
     loaded.load(tmp_path, device="cpu")
     view = noise_set(2).views[0]
     assert np.array_equal(loaded.render(view, 1.0).rgb, made.render(view, 1.0).rgb)
+    stored["used_offsets"][0] ^= 1  # one offset more or less than there are
+    save_tensors(tmp_path, stored, made.meta)
+    with pytest.raises(CheckpointError, match="fit together, found RuntimeError: shape mismatch"):
+        loaded.load(tmp_path, device="cpu")
 
 
 def test_more_offsets_than_bits() -> None:

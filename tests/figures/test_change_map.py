@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene.figures.canvas import rgb_of
 from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
 from chronoscene.figures.cloud import Cloud
 from chronoscene.harness.use.changes import CLASSES
@@ -47,7 +48,11 @@ def test_changes_are_drawn_over_what_is_below_them(cloud, tmp_path):
 def test_panels_in_rows(cloud, tmp_path, panels, shape):
     panel = ChangePanel("", cloud.xyz, np.zeros(3000, int))
     draw_changes(cloud, [panel] * panels, tmp_path / "x.png")
-    width, height = Image.open(tmp_path / "x.png").size
+    pixels = np.asarray(Image.open(tmp_path / "x.png").convert("RGB"))
+    height, width = pixels.shape[:2]
     one = 3.55 * 200, height / shape[0]
     assert round(width / one[0]) == shape[1]
     assert 0.4 * one[0] < one[1] < one[0]
+    shown = {tuple(color) for color in pixels[:150].reshape(-1, 3).tolist()}
+    assert {tuple(rgb_of(color)) for color in COLORS.values()} <= shown  # the whole legend
+    assert (pixels[:150, -10:] == 255).all()

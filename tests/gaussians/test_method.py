@@ -1,5 +1,6 @@
 """Saving and loading; what a method with a deformation field reuses."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +37,23 @@ def test_a_model_with_a_missing_group_is_refused(tmp_path):
     del method.model.parameters["quats"]
     method.save(tmp_path)
     with pytest.raises(CheckpointError, match="parameter groups"):
+        GaussianSplatting(GaussianConfig()).load(tmp_path, device="cpu")
+
+
+@pytest.mark.parametrize("value", [math.nan, -math.inf])
+def test_a_model_that_is_not_finite_is_refused(value, tmp_path):
+    method = train(toy_scene(), replace(SHORT, iterations=1))
+    method.model.parameters["means"].data[7, 1] = value
+    method.save(tmp_path)
+    with pytest.raises(CheckpointError, match="expected finite numbers .* found others in means;"):
+        GaussianSplatting(GaussianConfig()).load(tmp_path, device="cpu")
+
+
+def test_a_description_that_does_not_fit_is_refused(tmp_path):
+    method = train(toy_scene(), replace(SHORT, iterations=1))
+    method.meta["background"] = [0, None, 0]
+    method.save(tmp_path)
+    with pytest.raises(CheckpointError, match="fit together, found TypeError"):
         GaussianSplatting(GaussianConfig()).load(tmp_path, device="cpu")
 
 

@@ -1,6 +1,7 @@
 """Decoding: which colours a file has, which of its pixels count, what is refused."""
 
 import io
+import struct
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from PIL import Image
 
 from chronoscene.errors import ImageError
 from chronoscene.images.decoding import image_size, load_photo, load_rgb
+from chronoscene.validation.folder.pixels import read_header
 
 
 def save(tmp_path, image: Image.Image, name: str, **options):
@@ -125,6 +127,20 @@ def test_resizing_keeps_the_image_in_place(tmp_path):
     path = save(tmp_path, Image.fromarray(ramp.astype(np.uint8)), "a.png")
     small = load_rgb(path, size=(50, 10))[5, 5:-5, 0].astype(float) + 0.5
     np.testing.assert_allclose(small, (np.arange(50) + 0.5)[5:-5] * 4, atol=0.51)
+
+
+@pytest.mark.filterwarnings("ignore:::PIL")
+def test_a_tiff_file_with_rows_that_no_strip_has_is_damaged(tmp_path):
+    path = save(tmp_path, Image.effect_noise((40, 30), 50).convert("RGB"), "a.tif")
+    data = bytearray(path.read_bytes())
+    (directory,) = struct.unpack_from("<I", data, 4)
+    entries = range(directory + 2, len(data) - 12, 12)
+    rows = next(at for at in entries if struct.unpack_from("<H", data, at) == (257,))
+    struct.pack_into("<HII", data, rows + 2, 4, 1, 2**22 + 30)  # which would be 500 MB
+    path.write_bytes(data)
+    with pytest.raises(ImageError, match="found no data for all of its 40 x 4194334 pixels"):
+        load_rgb(path)
+    assert read_header(path).truncated
 
 
 @pytest.mark.filterwarnings("ignore:::PIL")

@@ -152,7 +152,8 @@ class RunRecord(BaseModel):
     resumed: int = 0
     """Number of times that the training was resumed from a checkpoint."""
     waited_seconds: float = 0.0
-    """Waiting for photos that were not decoded yet; not part of `seconds`."""
+    """Waiting for photos that were not decoded yet, and pauses of the process; not part of
+    `seconds`."""
     setup_seconds: float | None
     """Share of `seconds` before the first step."""
     render_seconds: Number | None

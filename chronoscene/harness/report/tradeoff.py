@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +37,9 @@ DRAWN_COSTS = (*TIMES, SIZE, "peak_memory_bytes", "peak_device_memory_bytes")
 BUDGET_TOLERANCE = 0.05
 """Share by which a training, without its last step, may exceed a time and still count as one that
 took it: a budget ends it after the step in which it runs out."""
+SAME_TIME = 0.01
+"""Share by which two times may differ and still be the same on a front: trainings of one budget end
+a step after it at the latest."""
 ANY_DEVICE = ""
 FRONT_COLUMNS = (
     *("scene", "device", "metric", "cost", "label", "method", "strategy", "preset", "variant"),
@@ -47,7 +51,7 @@ FRONT_COLUMNS = (
 all devices belong; ``quality`` is the mean of the metric and ``value`` that of the cost over ``n``
 seeds, in the unit of `RunRecord`, each with its sample standard deviation, None for one seed;
 ``on_front`` is True if no other configuration of the panel is as good for less, or better for as
-much.
+much, where times are as much as others within `SAME_TIME`.
 """
 
 
@@ -119,20 +123,28 @@ def _panel(entries: DataFrame, device: str, metric: str, cost: str) -> DataFrame
         quality_sd=both.sd.astype(object).where(both.n > 1, None),
         value=both.mean_of_cost,
         value_sd=both.sd_of_cost.astype(object).where(both.n > 1, None),
-        on_front=on_front(both.mean_of_cost.to_numpy(), sign * both["mean"].to_numpy()),
+        on_front=on_front(
+            both.mean_of_cost.to_numpy(),
+            sign * both["mean"].to_numpy(),
+            SAME_TIME if cost in TIMES else 0.0,
+        ),
     )
     return both[[*FRONT_COLUMNS]]
 
 
-def on_front(costs: NDArray[np.float64], quality: NDArray[np.float64]) -> NDArray[np.bool_]:
+def on_front(
+    costs: NDArray[np.float64], quality: NDArray[np.float64], tolerance: float = 0.0
+) -> NDArray[np.bool_]:
     """Find the points to which no other one is as good for less, or better for as much. [N]
 
     Args:
         costs: Less is better. [N]
         quality: More is better. [N]
+        tolerance: Share by which costs may differ that are the same.
     """
-    no_worse = (costs[:, None] <= costs) & (quality[:, None] >= quality)
-    better = (costs[:, None] < costs) | (quality[:, None] > quality)
+    more = costs * (1 + tolerance)
+    no_worse = (costs[:, None] <= more) & (quality[:, None] >= quality)
+    better = (more[:, None] < costs) | (quality[:, None] > quality)
     return np.logical_not((no_worse & better).any(axis=0))
 
 
@@ -188,7 +200,8 @@ def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[st
     """Name the configuration to use within limits, in a sentence for each scene and device.
 
     It is the best one in PSNR; where a PSNR is to be reached, the one that is trained in the least
-    time. Among those that read alike, it is the best in the other one, and then the smallest.
+    time. Among those that read alike, it is the best in the other one, then the smallest, and then
+    the best in digits that are not printed. All trainings that used up a time took as long.
 
     Args:
         records: Runs of any scenes.
@@ -203,7 +216,7 @@ def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[st
     for device, entries in entries_by_device(records).items():
         for scene, part in entries.groupby("scene", sort=False) if device else ():
             place = f"{scene}, {device}"
-            found = sorted(_configurations(part), key=_best_first)
+            found = sorted(_configurations(part), key=partial(_rank, budget=limits.seconds))
             fitting = [config for config in found if limits.excess(config) <= 1]
             if fitting and limits.psnr is not None:
                 best = min(fitting, key=lambda config: round(config["seconds"], 1))
@@ -244,8 +257,10 @@ def _configurations(entries: DataFrame) -> list[dict[str, Any]]:
     return found
 
 
-def _best_first(config: dict[str, Any]) -> tuple[float, float, float]:
-    return -round(config["psnr"], 2), config["seconds"], config[SIZE]
+def _rank(config: dict[str, Any], budget: float | None) -> tuple[float, float, float, float]:
+    """Return what is the least for the best; what a training took beyond the budget is no cost."""
+    seconds = round(min(config["seconds"], budget or math.inf), 1)
+    return -round(config["psnr"], 2), seconds, config[SIZE], -config["psnr"]
 
 
 def _sentence(config: dict[str, Any]) -> str:

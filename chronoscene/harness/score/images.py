@@ -25,7 +25,7 @@ from chronoscene.harness.files.provenance import (
 )
 from chronoscene.harness.plan.parts import check_scene
 from chronoscene.harness.score.scoring import score_run
-from chronoscene.images.decoding import image_size, load_rgb
+from chronoscene.images.decoding import image_size, load_opaque
 from chronoscene.images.store import ImageStore
 from chronoscene.io.staging import staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
@@ -89,7 +89,7 @@ def add_images(
     like the photos.
 
     Raises:
-        ImageError: If an image has another size, or cannot be decoded.
+        ImageError: If an image has another size or transparent pixels, or cannot be decoded.
     """
     resized = 0
     for frame in frames:
@@ -106,7 +106,7 @@ def add_images(
                 todo="render the view with the camera of the scene",
             )
         resized += size != target
-        pixels = load_rgb(path, size=target)
+        pixels = load_opaque(path, size=target)
         writer.add(frame.name, pixels, camera_period=frame.period, rendered_period=frame.period)
     return resized
 

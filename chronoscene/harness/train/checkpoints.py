@@ -42,7 +42,7 @@ class LoopState(BaseModel):
     """Time on the training clock."""
     setup_seconds: float = 0.0
     waited_seconds: float = 0.0
-    """Time spent waiting for photos; not on the training clock."""
+    """Time spent waiting for photos, or stopped; not on the training clock."""
     empty_steps: int = 0
     """Steps whose view showed no primitive."""
     skipped_steps: int = 0

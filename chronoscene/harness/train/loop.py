@@ -34,6 +34,9 @@ _REMEDY = (
     "one, or report this with the scene"
 )
 
+SHORTEST_PAUSE = 1.0
+"""Seconds; shorter pauses of the process stay on the clock."""
+
 Clock = Callable[[], float]
 """Return seconds, from any start."""
 
@@ -60,6 +63,32 @@ class Stopwatch:
 
     def __exit__(self, *error: object) -> None:
         self.seconds += self._now() - self._started
+
+
+class PauseDetector:
+    """Finds steps in which the process was stopped, or its machine asleep.
+
+    They take far longer than the mean of the steps before, and compute hardly more meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._steps, self._seconds, self._computed = 0, 0.0, 0.0
+
+    def pause(self, seconds: float, computed: float) -> float:
+        """Return how much of the next step was a pause, in seconds.
+
+        Args:
+            seconds: Time that it took.
+            computed: Computing time of the process in it, in seconds.
+        """
+        paused, steps = 0.0, max(self._steps, 1)
+        is_long = self._steps > 0 and seconds > max(SHORTEST_PAUSE, 10 * self._seconds / steps)
+        if is_long and computed < 5 * self._computed / steps:
+            paused = seconds - self._seconds / steps
+        self._steps += 1
+        self._seconds += seconds - paused
+        self._computed += computed
+        return paused
 
 
 Truth = Mapping[str, tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]
@@ -98,11 +127,12 @@ def train(
     device: str,
     observer: Observer,
     now: Clock = time.perf_counter,
+    computed: Clock = time.process_time,
     checkpoints: Checkpoints | None = None,
 ) -> LoopState:
     """Train a model, or a stage of it.
 
-    Probes, checkpoints, the observer and waits for photos are off the clock.
+    Probes, checkpoints, the observer, waits for photos and pauses of the process are off the clock.
 
     Args:
         method: An empty method; at a later stage, the method of the stage before.
@@ -113,6 +143,7 @@ def train(
         device: ``cpu`` or ``cuda``.
         observer: Shows the progress.
         now: The clock.
+        computed: Computing time of the process.
         checkpoints: Checkpoints to continue from and to write; None for a method that cannot be
             resumed.
 
@@ -125,6 +156,7 @@ def train(
     """
     seed_everything(seed)
     clock, waiting = Stopwatch(now), Stopwatch(lambda: part.store.waited)
+    pauses = PauseDetector()
     with clock, waiting:
         if part.extends:
             method.extend(part.train)
@@ -143,9 +175,11 @@ def train(
     unseen = deque[float](maxlen=max(NOT_FINITE_LIMIT, 2 * len(part.train.views)))
     latest = None
     while done < 1.0:
-        with clock, waiting:
+        with clock, waiting, Stopwatch(computed) as working:
             report = method.step(state.iterations, done)
         check_step(report, f"model {part.name}, iteration {state.iterations + 1}")
+        spent = clock.seconds - waiting.seconds - state.seconds
+        waiting.seconds += pauses.pause(spent, working.seconds)
         state.iterations += 1
         state.seconds = clock.seconds - waiting.seconds
         state.waited_seconds = waiting.seconds

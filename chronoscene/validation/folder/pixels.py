@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from chronoscene.errors import ImageError
-from chronoscene.images.decoding import is_transparent, load_rgb
+from chronoscene.images.decoding import is_covered, is_transparent, load_rgb, stored_size
 from chronoscene.images.exif import ExifData, exif_of
 from chronoscene.io.staging import sha256_of
 from chronoscene.validation.folder.grouping import grouped
@@ -109,10 +109,9 @@ def read_header(path: Path) -> Header:
 
 def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
     exif, kind = exif_of(image), image.format or ""
-    turned = kind == "TIFF" and exif.orientation >= 5  # Pillow gives the size after rotation
     return Header(
         problem=None,
-        size=image.size[::-1] if turned else image.size,
+        size=stored_size(image),
         mode=image.mode,
         orientation=exif.orientation,
         kind=kind,
@@ -137,6 +136,8 @@ def _is_truncated(path: Path, file: BinaryIO, image: Image.Image) -> bool:
     A file that does not end in its marker may still be complete: phones append other data. Only
     such files are read completely and, if the marker is really missing, decoded.
     """
+    if not is_covered(image):
+        return True
     kind = image.format or ""
     size = file.seek(0, os.SEEK_END)
     mark = END_MARKS.get(kind)

@@ -118,6 +118,16 @@ def test_a_training_may_exceed_a_time_by_its_last_step():
         choose(slow, Limits(seconds=30.0), "--budget 30s")
 
 
+def test_a_training_is_not_cheaper_for_ending_its_budget_a_step_earlier():
+    runs = [run("worse", 20.0, 60.0, 10**6), run("better", 25.0, 60.1, 9 * 10**6)]
+    assert on(front_points(runs), "seconds") == ["better"]
+    assert on(front_points(runs), "checkpoint_bytes") == ["worse", "better"]
+    alike = [run("big", 20.001, 60.04, 2_000_000), run("small", 20.0, 60.06)]
+    assert "SMALL" in choose(alike, Limits(seconds=60.0), "--budget 1m")[0]
+    twins = [run("worse", 20.0, 60.04), run("better", 20.004, 60.06)]
+    assert "BETTER" in choose(twins, Limits(seconds=60.0), "--budget 1m")[0]
+
+
 def test_what_reads_alike_is_chosen_by_the_rest():
     runs = [run("dear", 20.001, 50.0), run("big", 20.0, 5.0, 2_000_000), run("small", 20.0, 5.0)]
     assert "SMALL" in choose(runs, Limits(seconds=60.0), "--budget 1m")[0]

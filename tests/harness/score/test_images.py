@@ -61,6 +61,15 @@ def test_the_row_has_the_values_of_the_images(score, scene, tmp_path):
     assert set(record.absent) >= {"seconds", "peak_memory_bytes"} and record.notices == []
 
 
+def test_transparent_images_are_refused_and_an_opaque_alpha_channel_is_not(score, images):
+    first, second = images / VIEWS[0], images / VIEWS[1]
+    Image.new("RGBA", (24, 16), (90, 90, 90, 255)).save(first)
+    assert read_run(score()).notices == []
+    Image.new("RGBA", (24, 16), (90, 90, 90, 254)).save(second)
+    with pytest.raises(ImageError, match=r"1\.png: expected an image without transparent pixels"):
+        score(seed=1)
+
+
 def test_the_run_stands_beside_those_of_bench(score, bench_here, tmp_path):
     bench_here("toy_methods:MEAN", iterations=5)
     score()

@@ -161,6 +161,20 @@ def test_waiting_for_photos_is_off_the_clock_and_counted(part, clock):
     assert (trained.setup_seconds, trained.seconds, trained.waited_seconds) == (2.0, 4.5, 33.0)
 
 
+@pytest.mark.parametrize(
+    ("computed", "seconds"),
+    [(0.5, 2.5), (4.0, 42.25)],
+    ids=["stopped", "computing"],
+)
+def test_a_pause_of_the_process_is_off_the_clock_and_counted(part, clock, computed, seconds):
+    method, work = toy(), type(clock)()
+    usual = work.takes(0.25, clock.takes(0.25, method.step))
+    long = work.takes(computed, clock.takes(40.0, method.step))
+    method.step = lambda index, progress: (long if index == 6 else usual)(index, progress)
+    trained = run(method, part, StopRule(10, None), now=clock, computed=work)
+    assert (trained.seconds, trained.waited_seconds) == (seconds, 42.25 - seconds)
+
+
 def test_the_clock_is_that_of_the_machine(part):
     trained = run(toy(sleep=0.01), part, StopRule(None, 0.05))
     assert trained.seconds >= 0.05 and 1 <= trained.iterations <= 5
