@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,8 +27,7 @@ TABLE = Path(__file__).with_name("mutants.toml")
 GOAL = 0.95  # Share of the bugs that the tests must catch
 LIMIT = 120.0  # Seconds after which tests of a bug, an endless loop perhaps, have caught it
 
-# Compiled kernels, in __pycache__, go along.
-_LEFT_OUT = shutil.ignore_patterns(".*", "build", "demo", "dist", "runs", "*.egg-info")
+_LEFT_OUT = ("build", "demo", "dist", "runs")  # Folders of the repository that no test needs
 
 
 class StaleError(Exception):
@@ -68,16 +68,30 @@ def read_mutants(table: Path = TABLE) -> list[Mutant]:
     return [Mutant(name, **{**row, "tests": tuple(row["tests"])}) for name, row in rows.items()]
 
 
-def run_tests(root: Path, tests: Sequence[str], limit: float | None = LIMIT) -> int | None:
-    """Return the exit status of pytest, which stops at the first failure; None at the limit."""
-    options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-m", "not slow"]
-    environment = os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+def copy_repository(target: Path) -> Path:
+    """Copy the repository as it is now, with compiled kernels, which are in __pycache__."""
+
+    def left_out(folder: str, names: list[str]) -> list[str]:
+        at_root = Path(folder) == ROOT
+        return [n for n in names if n.startswith(".") or (at_root and n in _LEFT_OUT)]
+
+    return shutil.copytree(ROOT, target, ignore=left_out)
+
+
+def run_tests(root: Path, tests: Sequence[str], limit: float | None = None) -> int | None:
+    """Run pytest up to the first failure; without a limit of seconds, its output is shown.
+
+    Returns:
+        Its exit status; None at the limit.
+    """
+    options = ["-x", "-q", "-p", "no:cacheprovider"]
+    output = None if limit is None else subprocess.DEVNULL
     process = subprocess.Popen(
         [sys.executable, "-m", "pytest", *options, *tests],
         cwd=root,
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"},
+        stdout=output,
+        stderr=output,
         start_new_session=True,
     )
     try:
@@ -85,8 +99,8 @@ def run_tests(root: Path, tests: Sequence[str], limit: float | None = LIMIT) -> 
     except subprocess.TimeoutExpired:
         return None
     finally:
-        if process.poll() is None:
-            os.killpg(process.pid, 9)
+        if process.poll() is None:  # with the processes that it has started
+            os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
 
@@ -114,13 +128,13 @@ def survivors(root: Path, mutants: Sequence[Mutant]) -> list[Mutant]:
     for mutant in mutants:
         mutant.planted(root)
     tests = list(dict.fromkeys(test for mutant in mutants for test in mutant.tests))
-    if status := run_tests(root, tests, limit=None):
+    if status := run_tests(root, tests):
         raise StaleError(f"the tests do not pass without a bug: pytest ended with {status}")
     alive = []
     for mutant in mutants:
         begin = time.perf_counter()
         with planted(root, mutant):
-            status = run_tests(root, mutant.tests)
+            status = run_tests(root, mutant.tests, LIMIT)
         if status not in (0, 1, None):
             raise StaleError(f"{mutant.name}: the tests do not run, pytest ended with {status}")
         result = "survived" if status == 0 else "caught"
@@ -137,7 +151,7 @@ def main() -> int:
     mutants = [m for m in read_mutants() if not names or m.name in names]
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        copy = shutil.copytree(ROOT, Path(folder) / "copy", ignore=_LEFT_OUT)
+        copy = copy_repository(Path(folder) / "copy")
         try:
             alive = survivors(copy, mutants)
         except StaleError as error:

@@ -10,7 +10,6 @@ from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import RULES
 from chronoscene.validation.rules import all_rules, choose_rules
 
-
 ERRORS = """
 001 002 004 005 007 009
 101 102 103 105 106 107 108 111 112 121 125 131 132 133 141 143

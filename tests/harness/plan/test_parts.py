@@ -115,7 +115,11 @@ def test_three_periods_in_order(make_scene):
     last = scene.frames[6]
     assert [part.method_period(replace(last, period=2)) for part in parts] == [0.0, 1.0, 2.0]
     separate = parts_of(scene.with_frames(later), "separate")
-    assert [[v.name for v in p.train.views] for p in separate] == [TRAIN[:3], ["b/0.png"], TRAIN[4:]]
+    assert [[v.name for v in p.train.views] for p in separate] == [
+        TRAIN[:3],
+        ["b/0.png"],
+        TRAIN[4:],
+    ]
 
 
 def test_sequential_hides_the_period_from_methods_that_take_none(make_scene):
