@@ -1,6 +1,7 @@
 # make demo    a scene, its checks and a benchmark of four methods, from nothing
 # make test    lint, types and tests, from nothing
 # make lint    lint and types alone
+# make mutants plants bugs, and says which of them the tests catch: about ten minutes
 # make leaderboard  a site of the measured entries, in build/leaderboard; RUNS names folders of
 #              runs, whose pictures go with them
 # make clean   remove what demo and tools wrote; distclean also removes the environment
@@ -22,7 +23,7 @@ SCENE := $(DEMO)/demo
 DEMO_METHODS := chronogs,scaffold-gs,3dgs,4dgs
 DEMO_BUDGET := 90s
 
-.PHONY: demo leaderboard test lint clean distclean open3d-libraries
+.PHONY: demo leaderboard test lint mutants clean distclean open3d-libraries
 
 demo: $(DEMO)/.made
 	$(BIN)/chronoscene validate $(SCENE)
@@ -48,6 +49,9 @@ leaderboard: $(READY)
 
 test: lint
 	$(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
+
+mutants: $(READY)
+	$(BIN)/python tests/mutants/run.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

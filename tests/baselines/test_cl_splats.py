@@ -382,24 +382,31 @@ def test_one_training_takes_the_periods_in_order() -> None:
     """Under ``joint``, with as many passes over the views of each as of the others."""
     stages = [stage(0), second(begun())]
     images = [part.load_image(i) for part in stages for i in range(10)]
-    seen = np.ones((60, 2), bool)
+    later = [replace(view, period=2) for view in stages[1].views[5:]]
+    seen = np.ones((60, 3), bool)
     seen[:20, 0] = False
     joint = replace(
         stages[1],
-        views=stages[0].views + stages[1].views[:5],
+        views=(*stages[0].views, *stages[1].views[:5], *later),
+        num_periods=3,
         point_periods=seen,
         load_image=images.__getitem__,
     )
     parts = by_period(joint)
-    assert [{v.period for v in part.views} for part in parts] == [{0}, {1}]
+    assert [{v.period for v in part.views} for part in parts] == [{0}, {1}, {2}]
     np.testing.assert_array_equal(parts[1].load_image(3), images[13])
+    np.testing.assert_array_equal(parts[2].load_image(3), images[18])
     method = CLSplats(config())
     method.setup(joint, seed=0, device="cpu")
     assert len(method.model) == 40
-    for index in range(60):
-        method.step(index, index / 60)
-        assert trainer_of(method).stage == index // 40
-        assert method.model.period == trainer_of(method).stage
+    for number, steps in enumerate((range(40), range(40, 60), range(60, 80))):
+        for done, index in enumerate(steps):
+            method.step(index, index / 80)
+            trainer = trainer_of(method)
+            assert method.model.period == trainer.stage == number
+            # The schedule of each period begins anew, and ends with it.
+            moment = round(done / len(steps) * method.config.schedule_length) + 1
+            assert trainer.timeline.last_moment == moment
 
 
 def test_moments_are_steps_of_the_period_where_schedules_are_not_stretched(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_the_schedule_of_the_released_configuration() -> None:
     assert [d.moment for d in due if d.reset] == [3_000, 3_000, 6_000, 9_000]
     degrees = [d.sh_degree for d in due]
     assert [degrees.index(k) + 1 for k in range(4)] == [1, 1_000, 2_000, 3_000]
-    assert degrees[-1] == 3 and due[3_000].position_lr == due[0].position_lr
+    assert degrees[3_000:] == [3] * 15_000 and due[3_000].position_lr == due[0].position_lr
 
 
 def test_the_released_configuration_trains_in_both_stages() -> None:
@@ -180,6 +180,22 @@ def test_one_period_is_at_time_zero_and_others_are_evenly_spaced() -> None:
     assert one.model.times == (0,)
     near, far = (one.render(toy_scene().views[0], period).rgb for period in (0, 2.5))
     assert np.array_equal(near, far)
+
+
+@pytest.mark.parametrize("cells", [0, 9])
+def test_earlier_periods_read_the_same_rows_after_one_is_added(cells: int) -> None:
+    first = changed_method(moving_scene(arc), time_cells=cells).model
+    second = first.with_new_period()
+    third = second.with_new_period()
+    rows = first.field.time_cells
+    assert len(third.shared["planes.0.xt"]) == third.field.time_cells == rows + 2
+    places = [period * (rows - 1) / (PERIODS - 1) for period in range(PERIODS)]
+    assert third.times == pytest.approx([place / (rows + 1) for place in (*places, rows, rows + 1)])
+    for model in (second, third):
+        for period in (*range(PERIODS), PERIODS):
+            as_before = first.at_period(min(period, PERIODS - 1))
+            for name, tensor in model.at_period(period).items():
+                torch.testing.assert_close(tensor, as_before[name], msg=name)
 
 
 @pytest.mark.parametrize(("half", "row"), [(False, 0), (True, 2)])

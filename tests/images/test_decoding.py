@@ -121,6 +121,18 @@ def test_shrinking_smooths(tmp_path):
     assert np.abs(small[2:-2, 2:-2] - 127.5).max() < 3
 
 
+def test_photos_are_resized_by_the_bicubic_filter(tmp_path):
+    """Keys' kernel with a = -1/2, as wide as two of the larger pixels to each side."""
+    line = np.random.default_rng(0).integers(64, 192, 32)
+    path = save(tmp_path, Image.fromarray(np.tile(line.astype(np.uint8), (8, 1))), "a.png")
+    distance = np.abs((np.arange(32) + 0.5) / 2 - (np.arange(16)[:, None] + 0.5))
+    near = 1.5 * distance**3 - 2.5 * distance**2 + 1
+    far = -0.5 * distance**3 + 2.5 * distance**2 - 4 * distance + 2
+    weights = np.where(distance < 1, near, np.where(distance < 2, far, 0.0))
+    expected = weights @ line / weights.sum(axis=1)
+    np.testing.assert_allclose(load_rgb(path, size=(16, 8))[0, :, 0], expected, atol=1.0)
+
+
 def test_resizing_keeps_the_image_in_place(tmp_path):
     """A linear ramp sampled at pixel centres stays that ramp: no half-pixel shift."""
     ramp = np.broadcast_to(np.arange(200.0) + 0.5, (40, 200))

@@ -10,6 +10,26 @@ from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import RULES
 from chronoscene.validation.rules import all_rules, choose_rules
 
+ERRORS = """
+001 002 004 005 007 009
+101 102 103 105 106 107 108 111 112 121 125 131 132 133 141 143
+201 203 204 206 208 241 242
+301 302 303 304 305 306 307 323 325
+401 402 403
+501 502 504 505 512 514
+601 602
+"""
+REMARKS = """
+006
+104 134 137
+202 207 211 213
+308 310 321
+406 409
+507 509 525
+703 705 706
+"""
+"""Numbers of the rules of these severities, on which the exit status depends; others warn."""
+
 
 def codes(rules):
     return [r.code for r in rules]
@@ -25,6 +45,12 @@ def test_every_rule_is_documented():
 def test_every_rule_has_a_test_that_breaks_it():
     tests = "".join(p.read_text() for p in (Path(__file__).parent / "rules").glob("test_*.py"))
     assert [r.code for r in all_rules() if f'"{r.code}"' not in tests] == []
+
+
+def test_severities():
+    for severity, numbers in (("error", ERRORS), ("info", REMARKS)):
+        found = [r.code for r in all_rules() if r.severity == severity]
+        assert found == [f"CS{number}" for number in numbers.split()]
 
 
 def test_every_need_is_an_attribute_with_a_reason(tmp_path):

@@ -11,7 +11,7 @@ from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.parts import effective_strategy, make_parts, training_frame
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import load_spec
-from chronoscene.scene import Points
+from chronoscene.scene import Period, Points
 from chronoscene.scene.geometry import camera_centre
 
 TRAIN = ["a/0.png", "a/1.png", "a/3.png", "b/0.png", "b/3.png"]
@@ -96,6 +96,30 @@ def test_sequential_gives_one_model_the_periods_in_order(make_scene):
     assert [f.name for f in first.ahead] == ["b/1.png", "b/2.png"] and second.ahead == ()
     assert [first.method_period(f) for f in first.ahead] == [0.0, 0.0]
     assert [second.method_period(f) for f in second.test] == [0.0, 1.0, 1.0]
+
+
+def test_three_periods_in_order(make_scene):
+    """The last views of the second period are a period of their own."""
+    scene = make_scene(periods=tuple(Period(i, str(i)) for i in range(3)))
+    later = [replace(f, period=2) if f.name in ("b/2.png", "b/3.png") else f for f in scene.frames]
+    parts = parts_of(scene.with_frames(later), "sequential")
+    assert [part.extends for part in parts] == [False, True, True]
+    assert [part.train.num_periods for part in parts] == [1, 2, 3]
+    assert [{v.period for v in part.train.views} for part in parts] == [{0}, {1}, {2}]
+    assert [[f.name for f in part.test] for part in parts] == [
+        ["a/2.png"],
+        ["a/2.png", "b/1.png"],
+        ["a/2.png", "b/1.png", "b/2.png"],
+    ]
+    assert [[f.name for f in part.ahead] for part in parts] == [["b/1.png"], ["b/2.png"], []]
+    last = scene.frames[6]
+    assert [part.method_period(replace(last, period=2)) for part in parts] == [0.0, 1.0, 2.0]
+    separate = parts_of(scene.with_frames(later), "separate")
+    assert [[v.name for v in p.train.views] for p in separate] == [
+        TRAIN[:3],
+        ["b/0.png"],
+        TRAIN[4:],
+    ]
 
 
 def test_sequential_hides_the_period_from_methods_that_take_none(make_scene):

@@ -161,7 +161,7 @@ def test_views_without_masks_and_folders_of_scenes(runs, truth, tmp_path):
 def test_what_the_mask_of_a_photo_ignores_is_in_no_region(tmp_path):
     image = np.zeros((2, 3, 3), np.uint8)
     mask = np.array([[True, True, False], [False, True, True]])
-    changed = np.array([[True, False, True], [True, False, False]])
+    changed = np.array([[True, False, True], [False, False, False]])
     writer = ImageWriter(tmp_path)
     writer.add("x.png", image, camera_period=0, rendered_period=0, mask=mask)
     writer.close(kind="ground truth", scene="s", scene_hash="h", details={})

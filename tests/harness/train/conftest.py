@@ -21,6 +21,15 @@ class FakeClock:
 
         return timed
 
+    def waits(self, seconds, store, function):
+        """The function, which waits this long for photos of a store."""
+
+        def waiting(*args, **kwargs):
+            store.waited += seconds
+            return function(*args, **kwargs)
+
+        return self.takes(seconds, waiting)
+
 
 @pytest.fixture
 def clock():

@@ -178,9 +178,11 @@ def test_a_start_is_used_until_there_is_something_newer(make, tmp_path):
         restored(make(folder=tmp_path / "x", start=tmp_path / "nothing"))
 
 
-def run(method, part, stop, checkpoints=None):
+def run(method, part, stop, checkpoints=None, **changes):
+    for index in range(len(part.train.views)):
+        part.train.load_image(index)  # so that no test depends on how long that takes
     truth = {f.name: (part.store.load(f), part.store.load_mask(f)) for f in part.test}
-    options = {"seed": 0, "device": "cpu", "observer": lambda *step: None}
+    options = {"seed": 0, "device": "cpu", "observer": lambda *step: None, **changes}
     return train(method, part, stop, truth, checkpoints=checkpoints, **options)
 
 
@@ -221,6 +223,19 @@ def test_a_budget_goes_on_with_the_seconds_that_are_used(part, make):
     assert (done.iterations, done.seconds) == (40, 4.0)
     state = run(method, part, StopRule(None, 4.01), make())
     assert state.iterations > 40 and state.seconds >= 4.01
+
+
+def test_the_clock_goes_on_where_it_stopped_without_what_was_waited(part, make, clock):
+    def timed(method):
+        method.setup = clock.waits(3.0, part.store, clock.takes(2.0, method.setup))
+        method.step = clock.waits(3.0, part.store, clock.takes(0.25, method.step))
+        return method
+
+    with pytest.raises(SystemExit):
+        run(timed(dying_at(4)), part, StopRule(10, None), make(), now=clock)
+    state = run(timed(toy()), part, StopRule(10, None), make(), now=clock)
+    assert (state.resumed, state.iterations) == (1, 10)
+    assert (state.setup_seconds, state.seconds, state.waited_seconds) == (2.0, 4.5, 33.0)
 
 
 def test_no_checkpoint_is_made_of_a_training_in_trouble(part, make):

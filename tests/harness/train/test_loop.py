@@ -146,17 +146,9 @@ def test_probes_observers_and_rendering_are_off_the_clock(part, clock):
 
 
 def test_waiting_for_photos_is_off_the_clock_and_counted(part, clock):
-    def waiting(function):
-        def waits(*args, **options):
-            clock.seconds += 3.0
-            part.store.waited += 3.0
-            return function(*args, **options)
-
-        return waits
-
     method = toy()
-    method.setup = waiting(clock.takes(2.0, method.setup))
-    method.step = waiting(clock.takes(0.25, method.step))
+    method.setup = clock.waits(3.0, part.store, clock.takes(2.0, method.setup))
+    method.step = clock.waits(3.0, part.store, clock.takes(0.25, method.step))
     trained = run(method, part, StopRule(10, None), now=clock)
     assert (trained.setup_seconds, trained.seconds, trained.waited_seconds) == (2.0, 4.5, 33.0)
 

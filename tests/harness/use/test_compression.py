@@ -1,17 +1,21 @@
 """``chronoscene compress``: runs whose models take few bytes, beside those that they come from."""
 
 import shutil
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import cli
-from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.harness.files.predictions import load_image, read_manifest, to_bytes
 from chronoscene.harness.files.records import read_run, run_folders
+from chronoscene.harness.files.strategies import STRATEGIES
+from chronoscene.harness.use import compression
 from chronoscene.harness.use.compression import compress_run, spread
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.images.store import ImageStore
@@ -95,6 +99,35 @@ def test_every_period_has_a_view_however_many_there_are(copied):
     assert [f.period for f in spread(many, 9)] == list(range(40))
     assert [f.image_id for f in spread(many[:1] * 7, 3)] == [0] * 3
     assert spread(many[::40], 99) == tuple(many[::40])
+
+
+def test_the_model_of_a_period_is_judged_by_photos_of_that_period(
+    make_scene, tmp_path, monkeypatch
+):
+    judged = []
+
+    @contextmanager
+    def opened(run, period, frames, store):
+        judged.append((period, {(frame.period, frame.split) for frame in frames}))
+        yield SimpleNamespace(tensors={}, grids={}, scratch=None)
+
+    for name in ("encode", "_write"):
+        monkeypatch.setattr(compression, name, lambda *args: None)
+    monkeypatch.setattr(compression, "_opened", opened)
+    for strategy, expected in (
+        ("separate", [(0, {(0, "train")}), (1, {(1, "train")})]),
+        ("joint", [(0, {(0, "train"), (1, "train")})]),
+    ):
+        run = SimpleNamespace(
+            strategy=STRATEGIES[strategy],
+            record=SimpleNamespace(max_width=1600, variant=""),
+            folder=tmp_path / "scene/method/seed0",
+            num_periods=2,
+        )
+        with pytest.raises(SceneError, match=r"source\.json"):  # the run has no files
+            compress_run(run, make_scene(), max_loss=None, log=lambda line: None)
+        assert judged == expected
+        judged.clear()
 
 
 def test_a_run_in_stages_is_refused(copied):

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,12 @@ from chronoscene.cli import cli
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.files.records import ViewScore, read_rows
-from chronoscene.harness.use.leakage import depth_values, leakage_table, pair_values
+from chronoscene.harness.use.leakage import (
+    depth_values,
+    leakage_table,
+    measure_leakage,
+    pair_values,
+)
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.images.decoding import load_rgb
 from chronoscene.images.truth import APPEARANCE, GEOMETRY, truth_place
@@ -97,6 +103,58 @@ def test_pixels_that_do_not_count(truths):
     counted = ALL.copy()
     counted[:, 7] = False
     assert values_of(own, other, truths, counted)["invariant", "psnr"] == math.inf
+
+
+def test_pixels_that_do_not_count_are_in_no_value(truths):
+    """All values are those of images without these pixels."""
+    rng = np.random.default_rng(1)
+    photo, other = truths
+    other = other.copy()
+    other[:, 7] ^= 1  # where nothing changed, the light is another
+    shown = rng.integers(0, 256, (2, 6, 8, 3)).astype(np.uint8)
+    counted = ALL.copy()
+    counted[:, [0, 7]] = False
+    images = (*shown, photo, other, CHANGES, counted)
+    expected = pair_values(*(image[:, 1:7] for image in images))
+    assert {region for region, _ in expected} == {"all", "changed", "invariant"}
+    assert pair_values(*images) == pytest.approx(expected)
+
+
+def test_depth_counts_where_pixels_do():
+    depth, counted = np.full((6, 8), 2.2), ALL.copy()
+    depth[:, 0], counted[:, 0] = 9.0, False
+    assert depth_values(depth, np.full((6, 8), 2.0), counted) == pytest.approx(
+        {("all", "depth_abs_rel"): 0.1, ("all", "depth_rmse"): 0.2, ("all", "depth_delta"): 1.0}
+    )
+    assert depth_values(depth, np.where(counted, 0.0, 2.0), counted) == {}
+
+
+def test_masks_of_photos_and_all_other_periods(make_scene, tmp_path):
+    """Three periods; a view of which nothing counts is left out."""
+    mask = np.zeros((16, 24), bool)
+    mask[:, 5:] = True
+    masks = {"a/2.png": mask, "b/1.png": np.zeros((16, 24), bool)}
+    for name, values in masks.items():
+        Image.fromarray(values).save(tmp_path / name.replace("/", "_"))
+    scene = make_scene(masks={name: tmp_path / name.replace("/", "_") for name in masks})
+    rng = np.random.default_rng(2)
+    shown = rng.random((3, 16, 24, 3))
+    for other in (1, 2):
+        path = tmp_path / truth_place("cross_rgb", "a/2.png", other)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rng.integers(0, 256, (16, 24, 3), dtype=np.uint8)).save(path)
+    run = SimpleNamespace(
+        record=SimpleNamespace(max_width=1600),
+        num_periods=3,
+        render=lambda camera, pose, period: SimpleNamespace(rgb=shown[period], depth=None),
+    )
+    found = {rows[0].view: rows for rows in measure_leakage(run, scene, tmp_path)}
+    assert found.keys() == {"a/2.png", "b/2.png"}
+    truths = [load_rgb(scene.images_root / "a/2.png")]
+    truths += [load_rgb(tmp_path / truth_place("cross_rgb", "a/2.png", p)) for p in (1, 2)]
+    assert [(row.rendered_period, row.value) for row in found["a/2.png"]] == [
+        (p, psnr(to_bytes(shown[p]), truths[p], mask)) for p in range(3)
+    ]
 
 
 def test_depth_of_the_size_of_the_truth_only():

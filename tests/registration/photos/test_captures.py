@@ -47,6 +47,13 @@ def test_one_folder_is_cut_where_weeks_pass(tmp_path: Path) -> None:
     assert "proposed" in " ".join(found.remarks)
 
 
+def test_weeks_count_from_one_photo_to_the_next(tmp_path: Path) -> None:
+    """A visit may last longer than the gap that ends it: 10, 10, 13 and 14 days."""
+    for i, day in enumerate(("09:01", "09:11", "09:21", "10:04", "10:18")):
+        photo(tmp_path / f"{i}.jpg", taken=f"2016:{day} 12:00:00")
+    assert [c.period for c in read_captures(tmp_path).images] == [0, 0, 0, 0, 1]
+
+
 def test_one_folder_with_an_undated_photo_is_one_period(tmp_path: Path) -> None:
     photo(tmp_path / "a.jpg", taken="2016:09:01 12:00:00")
     photo(tmp_path / "b.jpg", taken="2019:09:01 12:00:00")

@@ -64,6 +64,21 @@ def test_wildly_wrong_positions_are_named_and_not_used() -> None:
     assert any(r.startswith("3.jpg: GPS is 2") for r in found.remarks)
 
 
+@pytest.mark.parametrize(("size", "limit"), [(0.05, 200.0), (1.0, None), (10.0, None)])
+def test_gross_errors_begin_at_twenty_median_distances_but_not_below_200_metres(
+    size: float, limit: float | None
+) -> None:
+    offsets = size * GRID
+    middle = np.median(offsets, axis=0)
+    median = float(np.median(np.linalg.norm(offsets - middle, axis=1)))
+    limit = limit or 20 * median
+    for share, plausible in ((0.94, True), (1.06, False)):
+        # Far to both sides, so that the median stays.
+        moved = np.concatenate([offsets, middle + share * limit * np.array([[1, 0], [-1, 0]])])
+        found = locate(captures(moved)).plausible
+        assert found.tolist() == [True] * 20 + [plausible] * 2
+
+
 def test_missing_positions_stay_missing() -> None:
     offsets = GRID.copy()
     offsets[5] = np.nan

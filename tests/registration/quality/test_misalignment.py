@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.registration.generated import CaseSettings, Generated, generate_case, pose_errors
 from chronoscene.registration.quality.misalignment import (
+    _interval,
+    _sandwich,
     measure,
     rotation_angle,
     transfer_errors,
@@ -143,6 +145,53 @@ def test_intervals_hold_the_truth() -> None:
         truth = np.median(rotation[model.periods == 1])
         hits += found.rotation.low <= truth <= found.rotation.high
     assert hits >= 18
+
+
+def test_bounds_are_as_far_away_as_the_errors_are_large(exact: Generated) -> None:
+    """Of a known motion, measured with noisy pixels: bounds can be too tight, and too wide."""
+    turn = Rotation.from_euler("x", 1, degrees=True).as_matrix()
+    move = Sim3(1.0, turn, np.array([0.5, 0.3, -0.4]))
+    model = moved_period(exact.model, move)
+    rays = held_out_rays(model)
+    rays = rays.where(np.isin(rays.track, np.unique(rays.track)[:100]))
+    centres = camera_centre(model.cam_from_world[model.periods == 1])
+    shift = np.median(np.linalg.norm(move.apply(centres) - centres, axis=1))
+    rng, errors = np.random.default_rng(0), []
+    for _ in range(16):
+        noisy = replace(rays, uv=rays.uv + rng.normal(0, 0.6 / 400, rays.uv.shape))
+        found = measure(*transfers(noisy, model.periods, 0, 1), centres)
+        assert found is not None
+        for interval, truth in ((found.rotation, 1.0), (found.shift, shift)):
+            errors.append((interval.value - truth) / (interval.high - interval.value))
+    # 1 but for the draws, whose root mean square is off by 1 / sqrt(2 * 16), or 18 %.
+    assert 0.5 < 1.96 * np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
+def test_more_images_of_a_track_and_small_residuals_do_not_narrow_a_bound() -> None:
+    rng, track = np.random.default_rng(0), np.arange(300)
+    residual, jacobian = 2 * rng.normal(size=(300, 2)), rng.normal(size=(300, 2, 7))
+    weight = np.ones(300)
+    once = _sandwich(track, residual, jacobian, weight)
+    ten_times = (np.repeat(x, 10, axis=0) for x in (track, residual, jacobian, weight))
+    np.testing.assert_allclose(_sandwich(*ten_times), once)
+    noise = np.linalg.inv(np.einsum("nki,nkj->ij", jacobian, jacobian))
+    ratios = [
+        np.mean(np.diag(_sandwich(track, size * residual, jacobian, weight)) / np.diag(noise))
+        for size in (1.0, 0.01)
+    ]
+    assert ratios == pytest.approx([4.0, 1.0], rel=0.15)
+
+
+def test_ends_of_intervals_are_percentiles_of_motions_drawn() -> None:
+    def turned(degrees: float) -> Sim3:
+        turn = Rotation.from_rotvec([0, 0, np.radians(degrees)]).as_matrix()
+        return Sim3(1.0, turn, np.zeros(3))
+
+    drawn, noise = ([turned(x) for x in np.linspace(0, end, 401)] for end in (4.0, 1.0))
+    for estimate, ends in ((2.0, (1.05, 3.9)), (0.5, (0.0, 3.9)), (3.95, (3.0, 3.95))):
+        found = _interval(lambda m: rotation_angle(m.rotation), turned(estimate), drawn, noise)
+        assert found.value == pytest.approx(estimate)
+        assert (found.low, found.high) == pytest.approx(ends)
 
 
 def test_matches_in_one_spot_leave_more_open() -> None:

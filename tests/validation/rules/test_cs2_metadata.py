@@ -76,7 +76,16 @@ def test_two_periods_of_one_day_have_no_order(scene):
     assert {f.code for f in scene.validate().findings} == {"CS507"}
 
 
-@pytest.mark.parametrize("date", ["2020", "2023-07", "2023-09-01", "9999", "0001-01-01"])
+@pytest.mark.parametrize("date", ["2023-06-03", "2023-04-02", "2023-04", "2023-06"])
+def test_photos_may_miss_a_stated_date_by_a_month(scene, date):
+    tag_dates(scene, "2016-05-03", "2023-05-03")
+    write_dates(scene, "2016-05", date)
+    assert {f.code for f in scene.validate().findings} == {"CS507"}
+
+
+@pytest.mark.parametrize(
+    "date", ["2020", "2023-07", "2023-06-04", "2023-04-01", "2023-03", "9999", "0001-01-01"]
+)
 def test_dates_against_periods_json(scene, date):
     tag_dates(scene, "2016-05-03", "2023-05-03")
     write_dates(scene, "2016-05", date)

@@ -52,6 +52,17 @@ def test_period_with_few_views(scene):
     scene.expect("CS405", place="period 1", found="4 training views")
 
 
+def codes(scene):
+    return {finding.code for finding in scene.validate().findings}
+
+
+@pytest.mark.parametrize(("train", "few"), [(4, True), (5, False)])
+def test_five_training_views_are_enough(scene, train, few):
+    tests = (("a", 3), ("b", 9 - train))
+    scene.write(TEST, [f"{p}{i:03d}.png" for p, n in tests for i in range(n)])
+    assert ("CS405" in codes(scene)) == few
+
+
 def test_single_period(scene):
     scene.write(SPLIT, [line.replace(" 1", " 0") for line in scene.lines(SPLIT)])
     report = scene.validate()
@@ -76,6 +87,23 @@ def test_test_share(make_scene):
     assert finding.expected == "about 6 test views of 40 images"
 
 
+@pytest.mark.parametrize(
+    ("images", "tests", "uneven"),
+    [
+        ((40, 40), (11, 2), True),  # less than a third of 6.5
+        ((40, 40), (10, 2), False),
+        ((40, 40), (7, 1), True),  # three fewer than 4
+        ((40, 40), (6, 1), False),
+        ((80, 8), (7, 4), True),  # three more than 1
+        ((80, 8), (8, 4), False),
+    ],
+)
+def test_limits_of_an_uneven_share(make_scene, images, tests, uneven):
+    listed = [f"{p}{i:03d}" for p, n in zip("ab", tests, strict=True) for i in range(n)]
+    scene = make_scene(names(a=images[0], b=images[1]), tests=listed)
+    assert ("CS408" in codes(scene)) == uneven
+
+
 def test_few_test_views_of_few_images_are_silent(make_scene):
     scene = make_scene(names(a=40, b=8), tests=[f"a{i:03d}" for i in range(10)] + ["b000"])
     assert {f.code for f in scene.validate().findings} == {"CS507", "CS705"}
@@ -84,3 +112,8 @@ def test_few_test_views_of_few_images_are_silent(make_scene):
 def test_periods_unequal(make_scene):
     scene = make_scene(names(a=70, b=7), tests=[f"a{i:03d}" for i in range(9)] + ["b000"])
     scene.expect("CS409", place="period 1", found="6", also={"CS705"})
+
+
+def test_a_tenth_of_the_training_views_is_enough(make_scene):
+    scene = make_scene(names(a=69, b=7), tests=[f"a{i:03d}" for i in range(9)] + ["b000"])
+    assert "CS409" not in codes(scene)  # 60 and 6

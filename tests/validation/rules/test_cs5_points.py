@@ -98,6 +98,15 @@ def test_points_without_colours(make_scene):
     assert (finding.place, finding.found) == (POINTS, "#000000 for 97.5 % of them")
 
 
+def test_one_colour_for_nineteen_of_twenty_points_is_none_too_many(make_scene):
+    scene = make_scene(points=200, form="text")
+    lines = [line.split() for line in scene.lines(POINTS) if not line.startswith("#")]
+    for words in lines[:-10]:
+        words[4:7] = ["0", "0", "0"]
+    scene.write(POINTS, [" ".join(words) for words in lines])
+    assert "CS522" not in {f.code for f in scene.validate().findings}
+
+
 def test_points_with_colours(make_scene):
     scene = make_scene(points=200, form="text")
     assert "CS522" not in {f.code for f in scene.validate().findings}
