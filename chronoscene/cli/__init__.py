@@ -22,6 +22,7 @@ COMMANDS = {
     "convert": "chronoscene.cli.scenes.convert:command",
     "doctor": "chronoscene.cli.doctor:command",
     "download": "chronoscene.cli.scenes.download:command",
+    "edit": "chronoscene.cli.scenes.edit:command",
     "export": "chronoscene.cli.runs.export:command",
     "leakage": "chronoscene.cli.runs.leakage:command",
     "leaderboard": "chronoscene.cli.report.leaderboard:leaderboard_command",
