@@ -40,6 +40,7 @@ COMMANDS = {
     "table": "chronoscene.cli.report.results:table",
     "tradeoff": "chronoscene.cli.report.tradeoff:command",
     "tune": "chronoscene.cli.runs.tune:command",
+    "triangulate": "chronoscene.cli.scenes.triangulate:command",
     "undistort": "chronoscene.cli.scenes.undistort:command",
     "validate": "chronoscene.cli.scenes.validate:command",
     "verify": "chronoscene.cli.report.verify:command",
