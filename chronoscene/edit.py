@@ -111,12 +111,7 @@ def edit(
     images = _renames(scene, edits.rename)[1]
     names = {f.name: images.get(f.name, f.name) for f in done.scene.frames}
     write_renamed(
-        done.scene,
-        out,
-        names,
-        texts=our_format.TEXTS,
-        image_source=image_source,
-        progress=progress,
+        done.scene, out, names, texts=our_format.TEXTS, image_source=image_source, progress=progress
     )
     return replace(done, scene=our_format.read(out))
 
@@ -198,9 +193,7 @@ def find_images(names: Sequence[str], patterns: Iterable[str], option: str) -> s
                 )
         if not fits:
             todo = nearest(text, names, otherwise="write names below images/, or patterns with *")
-            raise ConfigError(
-                option, expected="the name of an image", found=repr(text), todo=todo
-            )
+            raise ConfigError(option, expected="the name of an image", found=repr(text), todo=todo)
         found.update(fits)
     return found
 
@@ -226,9 +219,7 @@ def _chosen_periods(scene: Scene, texts: Iterable[str], option: str) -> set[int]
                 label if label == str(i) else f"{i} ({label})" for i, label in enumerate(labels)
             )
             todo = nearest(text, labels, otherwise="choose one of them")
-            raise ConfigError(
-                option, expected=f"a period: {listed}", found=repr(text), todo=todo
-            )
+            raise ConfigError(option, expected=f"a period: {listed}", found=repr(text), todo=todo)
         chosen |= found
     return chosen
 
@@ -257,9 +248,7 @@ def _inside(points: Points, box: Box) -> NDArray[np.bool_]:
     return inside
 
 
-def _sees_only_outside(
-    points: Points, inside: NDArray[np.bool_], frames: int
-) -> NDArray[np.bool_]:
+def _sees_only_outside(points: Points, inside: NDArray[np.bool_], frames: int) -> NDArray[np.bool_]:
     """Return True for images that observe points, but none of those inside. [F]"""
     counted = np.repeat(inside, np.diff(points.track_start))
     some = np.bincount(points.track_frame, minlength=frames) > 0

@@ -149,7 +149,10 @@ def test_an_image_gets_another_name_with_its_mask_and_tracks(run, tmp_path):
 
 def test_ids_as_labels_follow_the_numbers(make_scene_folder):
     scene = read_scene(make_scene_folder(NAMES))
-    assert apply(scene, Edits(drop_periods=("0",))).scene.periods == (Period(0, "0"), Period(1, "1"))
+    assert apply(scene, Edits(drop_periods=("0",))).scene.periods == (
+        Period(0, "0"),
+        Period(1, "1"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -185,7 +188,7 @@ def test_images_because_of_which_a_scene_cannot_be_read(folder):
     )
     split = folder / "sparse/split.txt"
     split.write_text(split.read_text().replace("new/05.png 2\n", ""))
-    with pytest.raises(SceneError, match="a period for every registered image, 'new/05.png' too"):
+    with pytest.raises(SceneError, match="a period for every registered image"):
         read_for_edit(detect(folder), Edits(drop=("old/02.png",)))
     edits = Edits(drop=("old/02.png", "new/05.png"), rename={"0": "x"})
     scene, left, unread = read_for_edit(detect(folder), edits)

@@ -114,7 +114,7 @@ def check_image(place: Path, image: PosedImage) -> None:
         found = "a different matrix, from a quaternion that is too large or too small"
         wrong = f"a rotation in the pose of {image.name!r}", found
     if wrong is not None:
-        todo = "remove the image from the model, or register it again"
+        todo = "leave it out (chronoscene edit SCENE OUT --drop IMAGE), or register it again"
         raise SceneError(place, expected=wrong[0], found=wrong[1], todo=todo)
     if not camera.is_usable:
         raise SceneError(

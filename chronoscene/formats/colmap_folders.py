@@ -2,9 +2,9 @@
 
 The first folder of an image name is its period; periods are in the natural order of the folders
 (``t2`` before ``t10``), which are also their labels. With ``--period-by``, the dates of the photos
-or a table are the periods instead, and images need no folders. ``sparse/0/test.txt`` lists the test
-images, and ``sparse/periods.json`` and ``sparse/world.json`` hold labels, dates and the world frame,
-where they exist, as in the ChronoScene format.
+or a table are the periods instead, and images need no folders. As in the ChronoScene format,
+``sparse/0/test.txt`` may list the test images, ``sparse/periods.json`` may have labels and dates of
+the periods, and ``sparse/world.json`` the world frame.
 """
 
 from __future__ import annotations

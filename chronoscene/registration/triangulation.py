@@ -137,9 +137,7 @@ def _read_points(scene: Scene, names: Mapping[str, str], folder: Path) -> Points
     points = without_twins(found.points)
     row = {names[frame.name]: i for i, frame in enumerate(scene.frames)}
     frame = np.array([row[image.name] for image in found.images], np.int32)
-    return replace(
-        points, ids=np.arange(1, len(points) + 1), track_frame=frame[points.track_frame]
-    )
+    return replace(points, ids=np.arange(1, len(points) + 1), track_frame=frame[points.track_frame])
 
 
 def _check_result(scene: Scene, points: Points, result: Mapping[str, Any]) -> None:

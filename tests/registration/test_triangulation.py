@@ -63,9 +63,7 @@ def test_points_project_to_where_they_were_found(done: tuple[Path, Triangulated]
     scene = read_scene(done[0])
     points = scene.points
     views = [(f.camera, f.cam_from_world) for f in scene.frames]
-    found = reproject(
-        views, points.xyz, points.track_start, points.track_frame, points.track_xy
-    )
+    found = reproject(views, points.xyz, points.track_start, points.track_frame, points.track_xy)
     errors = np.concatenate([error for _, error, _ in found])
     assert np.isfinite(errors).all() and np.median(errors) < 0.5 and errors.max() < 6
     assert len(without_twins(points)) == len(points)

@@ -74,10 +74,9 @@ def summary(done: Triangulated, out: Path) -> str:
     """Counts and errors, for people."""
     scene = done.scene
     points = scene.points
+    seen = (scene.count_views() > 0).sum(axis=0)
     lines = [f"{out}: {describe(scene)}"]
-    seen = scene.count_views() > 0
-    for period in scene.periods:
-        lines.append(f"  period {period.id} ({period.label}): sees {seen[:, period.id].sum()}")
+    lines += [f"  period {p.id} ({p.label}): sees {seen[p.id]} points" for p in scene.periods]
     lines.append(
         f"{done.agreeing} of {done.matches} matches in {done.pairs} pairs agree with the poses"
     )

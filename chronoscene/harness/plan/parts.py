@@ -205,7 +205,7 @@ def _training_set(
             f"{scene.root}: period {known[-1]}" if len(known) == 1 else scene.root,
             expected="sparse points that a training image sees",
             found="none",
-            todo="triangulate points with COLMAP",
+            todo="triangulate some: chronoscene triangulate SCENE OUT",
         )
     points = to_training.apply(scene.points.xyz[kept])
     if np.ptp(points, axis=0).max() < LEAST_SPREAD:
@@ -213,7 +213,7 @@ def _training_set(
             scene.root,
             expected="sparse points in different places",
             found=f"{len(points)} in one place",
-            todo="triangulate points with COLMAP",
+            todo="triangulate some: chronoscene triangulate SCENE OUT",
         )
     return TrainingSet(
         views=tuple(_training_view(f, store, to_training, hide_period) for f in frames),

@@ -6,7 +6,7 @@ epipolar lines. No random samples are drawn, so pairs with few right matches are
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -78,9 +78,7 @@ def _verify(model: pycolmap.Reconstruction, database: str) -> tuple[int, int]:
     return sum(map(len, matches.values())), sum(int(mask.sum()) for mask in good.values())
 
 
-def _store_verified(
-    database: pycolmap.Database, first: int, second: int, rows: np.ndarray
-) -> None:
+def _store_verified(database: pycolmap.Database, first: int, second: int, rows: np.ndarray) -> None:
     geometry = pycolmap.TwoViewGeometry()
     geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
     geometry.inlier_matches = rows.astype(np.uint32)

@@ -26,11 +26,7 @@ NUMBER = "number the periods from 0 without gaps; put labels and dates into spar
 REGISTER_MORE = "register more images of this period"
 
 
-@rule.error(
-    "CS401",
-    bad="ids 2016 and 2023; ids 0 and 2",
-    remedy=NUMBER,
-)
+@rule.error("CS401", bad="ids 2016 and 2023; ids 0 and 2", remedy=NUMBER)
 def period_ids(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
     """The period ids are not 0..T-1."""
     if not split and any(p.kind in ("fields", "period") for p in scene.split_problems):
@@ -57,7 +53,7 @@ def doubtful_ids(split: Sequence[SplitEntry]) -> set[int]:
 @rule.error(
     "CS402",
     bad="COLMAP could not register any photo of period 2",
-    remedy="register images of this period, or remove it and renumber the others",
+    remedy="register images of this period, or delete its lines and number the others from 0",
     needs=("images",),
 )
 def period_empty(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
