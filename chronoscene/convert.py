@@ -104,7 +104,7 @@ def obstacles(scene: Scene) -> list[str]:
         )
     if not len(scene.points):
         found.append(
-            "the scene has no points, and methods are initialised from points; triangulate some"
+            "the scene has no points, and methods start from points: run chronoscene triangulate"
         )
     if not scene.select(split="train"):
         found.append(

@@ -26,7 +26,7 @@ LAYERS = (
     ("chronoscene.anchors", "chronoscene.gaussians"),
     ("chronoscene.training",),
     ("chronoscene.rasterizer", "chronoscene.metrics"),
-    ("chronoscene.convert", "chronoscene.undistort"),
+    ("chronoscene.convert", "chronoscene.edit", "chronoscene.undistort"),
     ("chronoscene.methods", "chronoscene.formats"),
     ("chronoscene.images",),
     ("chronoscene.colmap",),

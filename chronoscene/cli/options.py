@@ -152,8 +152,8 @@ def add_options(*names: str) -> Callable[[Any], Any]:
     return lambda command: reduce(lambda found, option: option(found), options, command)
 
 
-def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
-    """Parse ``KEY=VALUE`` texts.
+def parse_assignments(assignments: tuple[str, ...], option: str = "--set") -> dict[str, str]:
+    """Parse ``KEY=VALUE`` texts of an option.
 
     Raises:
         ConfigError: If one has no ``=``, or a key is there twice.
@@ -164,12 +164,12 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
         key, value = key.strip(), value.strip()
         if not equals or not key:
             raise ConfigError(
-                "--set", expected="KEY=VALUE", found=repr(text), todo="write KEY=VALUE"
+                option, expected="KEY=VALUE", found=repr(text), todo="write KEY=VALUE"
             )
         if key in parsed:
             found = f"{parsed[key]} and {value}"
             raise ConfigError(
-                f"--set {key}", expected="one value", found=found, todo="leave one out"
+                f"{option} {key}", expected="one value", found=found, todo="leave one out"
             )
         parsed[key] = value
     return parsed

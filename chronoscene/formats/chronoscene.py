@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ TEST = "sparse/0/test.txt"
 MODEL = "sparse/0"
 PERIODS = "sparse/periods.json"
 WORLD = "sparse/world.json"
+TEXTS = (SPLIT, TEST, PERIODS, WORLD)
 
 MAX_COORDINATE = 1e100  # Larger than any world; squares and sums of such numbers are still finite
 
@@ -113,7 +114,7 @@ def check_image(place: Path, image: PosedImage) -> None:
         found = "a different matrix, from a quaternion that is too large or too small"
         wrong = f"a rotation in the pose of {image.name!r}", found
     if wrong is not None:
-        todo = "remove the image from the model, or register it again"
+        todo = "leave it out (chronoscene edit SCENE OUT --drop IMAGE), or register it again"
         raise SceneError(place, expected=wrong[0], found=wrong[1], todo=todo)
     if not camera.is_usable:
         raise SceneError(
@@ -221,8 +222,8 @@ def check_writable_name(place: Path, frame: Frame) -> None:
         )
 
 
-def write_texts(scene: Scene, root: Path) -> None:
-    """Write all files of the format but the images into an existing folder."""
+def write_texts(scene: Scene, root: Path, texts: Collection[str] = TEXTS) -> None:
+    """Write the model and some texts of the format, all but the images, into an existing folder."""
     (root / MODEL).mkdir(parents=True)
     write_model(root / MODEL, scene.frames, scene.points)
     tests = [f.name for f in scene.frames if f.split == "test"]
@@ -232,5 +233,5 @@ def write_texts(scene: Scene, root: Path) -> None:
         PERIODS: json.dumps(period_items(scene.periods), indent=1, ensure_ascii=False) + "\n",
         WORLD: json.dumps(world_item(scene.world)) + "\n",
     }
-    for name, text in files.items():
-        (root / name).write_text(text, encoding="utf-8", newline="\n")
+    for name in texts:
+        (root / name).write_text(files[name], encoding="utf-8", newline="\n")

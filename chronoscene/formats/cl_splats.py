@@ -21,6 +21,7 @@ from pathlib import Path
 from chronoscene.colmap.model import PosedImage
 from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
+from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared import colmap_layout, transforms
 from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
 from chronoscene.formats.shared.ply import read_points
@@ -145,7 +146,7 @@ def write(
         scene.with_frames([replace(f, camera=_readable(f.camera)) for f in scene.frames]),
         Path(out),
         _written_names(scene),
-        test_list=False,
+        texts=(our_format.PERIODS, our_format.WORLD),
         image_source=image_source,
         progress=progress,
     )
@@ -169,10 +170,8 @@ def losses(scene: Scene) -> list[str]:
     """List the content of a scene that this format, or the loader that it is for, cannot hold."""
     names = _written_names(scene)
     old = {new: name for name, new in names.items()}
-    order = sorted({_step(name) for name in old}, key=natural_key)
     rule = f"every {TEST_EVERY}th image of all"
     return [
-        *colmap_layout.lost_labels(scene, order),
         *colmap_layout.lost_names(names),
         *colmap_layout.lost_masks(scene),
         *colmap_layout.lost_split(scene, {old[name] for name in sorted(old)[::TEST_EVERY]}, rule),

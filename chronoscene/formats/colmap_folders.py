@@ -2,8 +2,9 @@
 
 The first folder of an image name is its period; periods are in the natural order of the folders
 (``t2`` before ``t10``), which are also their labels. With ``--period-by``, the dates of the photos
-or a table are the periods instead, and images need no folders. ``sparse/0/test.txt`` lists the test
-images where it exists, as in the ChronoScene format.
+or a table are the periods instead, and images need no folders. As in the ChronoScene format,
+``sparse/0/test.txt`` may list the test images, ``sparse/periods.json`` may have labels and dates of
+the periods, and ``sparse/world.json`` the world frame.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 
 from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
+from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import nerfstudio, wat
 from chronoscene.formats.shared import colmap_layout, grouping
 from chronoscene.images.exif import capture_times
@@ -44,7 +46,8 @@ def matches(path: Path, model: FoundModel | None) -> bool:
 
 def read(path: Path, *, period_by: str = "folder", model: FoundModel | None = None) -> Scene:
     """Read a scene."""
-    return colmap_layout.read_scene(path, model, partial(assign, period_by=period_by), NAME)
+    by_rule, labelled = partial(assign, period_by=period_by), period_by == "folder"
+    return colmap_layout.read_scene(path, model, by_rule, NAME, labelled=labelled)
 
 
 def assign(images: Path, names: list[str], *, period_by: str = "folder") -> colmap_layout.Assigned:
@@ -109,7 +112,7 @@ def write(
         scene,
         Path(out),
         _names(scene),
-        test_list=True,
+        texts=(our_format.TEST, our_format.PERIODS, our_format.WORLD),
         image_source=image_source,
         progress=progress,
     )
@@ -117,8 +120,7 @@ def write(
 
 def losses(scene: Scene) -> list[str]:
     """List the content of a scene that this format cannot hold."""
-    labels = colmap_layout.period_folders(scene.periods)
-    return colmap_layout.lost_labels(scene, labels) + colmap_layout.lost_names(_names(scene))
+    return colmap_layout.lost_names(_names(scene))
 
 
 def _names(scene: Scene) -> dict[str, str]:

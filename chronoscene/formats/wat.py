@@ -22,6 +22,7 @@ from pathlib import Path
 
 from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
+from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_labels
 from chronoscene.images.store import ImageSource, Progress
@@ -88,7 +89,7 @@ def write(
         scene.with_frames([replace(frame, camera=camera) for frame in scene.frames]),
         Path(out),
         _names(scene),
-        test_list=False,
+        texts=(our_format.PERIODS, our_format.WORLD),
         image_source=image_source,
         progress=progress,
     )
@@ -118,7 +119,7 @@ def losses(scene: Scene) -> list[str]:
     names = _names(scene)
     old = {new: name for name, new in names.items()}
     taken = default_tests({names[f.name]: f.period for f in scene.frames})
-    lost = colmap_layout.lost_labels(scene, _folders(scene)) + colmap_layout.lost_names(names)
+    lost = colmap_layout.lost_names(names)
     tests = {old[name] for name in taken}
     lost += colmap_layout.lost_split(scene, tests, "images 0, 8, 16, ... of each task")
     lost += colmap_layout.lost_masks(scene)

@@ -261,7 +261,8 @@ def place_image(source: Path, target: Path, image_source: ImageSource) -> None:
         SceneError: If it is missing, or its target exists.
     """
     if not source.is_file():
-        raise SceneError(source, expected="an image", found="nothing", todo="copy it there")
+        todo = "copy it there, or leave the image out (chronoscene edit SCENE OUT --drop IMAGE)"
+        raise SceneError(source, expected="an image", found="nothing", todo=todo)
     if os.path.lexists(target):  # a/b and a//b; or a and A on a disk that ignores case
         raise SceneError(
             target,

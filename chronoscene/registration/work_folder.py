@@ -160,6 +160,7 @@ TASKS = {
     "joint": "chronoscene.registration.reconstruct.routes:joint",
     "separate": "chronoscene.registration.reconstruct.routes:separate",
     "frozen": "chronoscene.registration.reconstruct.routes:add_period",
+    "triangulate": "chronoscene.registration.reconstruct.known_poses:triangulate_scene",
     "refine": "chronoscene.registration.reconstruct.routes:refine",
 }
 """``module:function`` of each task. It takes a dictionary and a `Report`, and returns JSON data."""

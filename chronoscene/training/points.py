@@ -21,7 +21,7 @@ def finite_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
             "sparse points",
             expected="at least one point with finite coordinates",
             found=f"{len(points)} points",
-            todo="triangulate the scene: models start from its sparse points",
+            todo="triangulate some (chronoscene triangulate): models start from sparse points",
         )
     return finite
 

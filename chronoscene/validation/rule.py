@@ -36,6 +36,10 @@ but probably not as its author intended, or another program fails on it. info: w
 nothing needs repair.
 """
 
+LEAVE_OUT = "chronoscene edit DIR OUT --drop IMAGE"
+RENAME = "chronoscene edit DIR OUT --rename OLD=NEW"
+TRIANGULATE = "chronoscene triangulate DIR OUT"
+
 NOTHING = "nothing to do"  # Remedy of findings that are for information only
 
 

@@ -104,9 +104,7 @@ def test_what_is_written_says_the_time_step_in_the_name(make_scene_folder, tmp_p
 
 def test_names_that_would_become_one_are_refused(make_scene_folder, tmp_path):
     scene = read_scene(make_scene_folder({"a/0.png": 0, "a_0.png": 0, "b/0.png": 1}))
-    with pytest.raises(
-        SceneError, match="image names that remain distinct when / becomes _, found '"
-    ):
+    with pytest.raises(SceneError, match="distinct image names, found '"):
         cl_splats.write(scene, tmp_path / "out")
 
 

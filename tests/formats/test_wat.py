@@ -129,7 +129,5 @@ def test_what_clnerf_does_otherwise_is_said(make_scene_folder):
 
 def test_names_that_would_become_one_are_refused(make_scene_folder, tmp_path):
     scene = read_scene(make_scene_folder({"a/x/0.png": 0, "a/x_0.png": 0, "b/0.png": 1}))
-    with pytest.raises(
-        SceneError, match="image names that remain distinct when / becomes _, found '"
-    ):
+    with pytest.raises(SceneError, match="distinct image names, found '"):
         wat.write(scene, tmp_path / "out", image_source="none")

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.colmap.model import Model, read_model, write_model
+from chronoscene.colmap.model import Model, read_model
 from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats.shared.grouping import Grouped, label_date, natural_key
+from chronoscene.formats.shared.grouping import Grouped, natural_key
 from chronoscene.images.masks import find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
-from chronoscene.scene import Period, Scene, WorldFrame
+from chronoscene.scene import Period, Scene
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 
@@ -63,7 +63,12 @@ def is_in_folders(images: Path) -> bool:
 
 
 def read_scene(
-    path: Path, model: FoundModel | None, assign: Callable[[Path, list[str]], Assigned], format: str
+    path: Path,
+    model: FoundModel | None,
+    assign: Callable[[Path, list[str]], Assigned],
+    format: str,
+    *,
+    labelled: bool = True,
 ) -> Scene:
     """Read a scene whose periods follow from the names of its images.
 
@@ -72,6 +77,7 @@ def read_scene(
         model: Its COLMAP model, if there is one.
         assign: Periods and tests of the images with these names, which are in this folder.
         format: Name of the format.
+        labelled: False if ``sparse/periods.json`` is about other periods.
 
     Raises:
         SceneError: If the model is missing or damaged.
@@ -82,7 +88,10 @@ def read_scene(
     tests, rule = assigned.tests, assigned.rule
     if tests is None:
         tests, rule = our_format.read_tests(path, names, assigned.grouped[0])
-    return make_scene(path, images, posed, assigned.grouped, tests, rule=rule, format=format)
+    scene = make_scene(path, images, posed, assigned.grouped, tests, rule=rule, format=format)
+    if labelled and (path / our_format.PERIODS).exists():
+        scene = replace(scene, periods=our_format.read_periods(path, scene.num_periods))
+    return replace(scene, world=our_format.read_world(path))
 
 
 def read_images(path: Path, found: FoundModel | None) -> tuple[Model, Path]:
@@ -153,14 +162,14 @@ def write_renamed(
     out: Path,
     names: Mapping[str, str],
     *,
-    test_list: bool,
+    texts: Collection[str],
     image_source: ImageSource,
     progress: Progress | None,
 ) -> Path:
     """Write ``images/`` and ``sparse/0`` with other image names; complete or not at all.
 
-    ``names`` maps old to new names of images; with ``test_list``, ``sparse/0/test.txt`` is written.
-    The rest is as for `chronoscene.formats.chronoscene`.
+    ``names`` maps old to new names of images; of `our_format.TEXTS`, those in ``texts`` are
+    written. The rest is as for `chronoscene.formats.chronoscene`.
 
     Raises:
         SceneError: If ``out`` is in use, an image is missing, or two new names are equal.
@@ -170,19 +179,15 @@ def write_renamed(
         if (other := olds.setdefault(name, old)) != old:
             raise SceneError(
                 out,
-                expected="image names that remain distinct when / becomes _",
+                expected="distinct image names",
                 found=f"{other!r} and {old!r}, both {name!r}",
-                todo="rename one of the images, in images/ and in the model",
+                todo="rename one of the images (chronoscene edit --rename OLD=NEW)",
             )
     new = _renamed(scene, names)
     for frame in new.frames:
         our_format.check_writable_name(out, frame)
     with staged_folder(out) as staged:
-        (staged / our_format.MODEL).mkdir(parents=True)
-        write_model(staged / our_format.MODEL, new.frames, new.points)
-        if test_list:
-            tests = "".join(f"{f.name}\n" for f in new.frames if f.split == "test")
-            (staged / our_format.TEST).write_text(tests, encoding="utf-8", newline="\n")
+        our_format.write_texts(new, staged, texts)
         (staged / "images").mkdir()
         place_images(
             scene, staged / "images", names=names, image_source=image_source, progress=progress
@@ -229,18 +234,6 @@ def new_names(scene: Scene, folders: list[str], *, deep: bool) -> dict[str, str]
         return {name: name for name in old}
     flat = {name: name if deep else name.replace("/", "_") for name in old}
     return {name: f"{folder}/{flat[name]}" for name, folder in old.items()}
-
-
-def lost_labels(scene: Scene, labels: list[str]) -> list[str]:
-    """Losses of a format that has only a label for each period."""
-    lost = []
-    if labels != [period.label for period in scene.periods]:
-        lost.append(f"the labels of the periods as they are (but: {', '.join(labels[:8])})")
-    if any(p.date != label_date(label) for p, label in zip(scene.periods, labels, strict=True)):
-        lost.append("the dates of the periods")
-    if scene.world != WorldFrame():
-        lost.append("unit and reference system of the world")
-    return lost
 
 
 def lost_names(names: Mapping[str, str]) -> list[str]:

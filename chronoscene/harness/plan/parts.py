@@ -136,6 +136,25 @@ def check_scene(scene: Scene) -> None:
         )
 
 
+def check_points(scene: Scene) -> None:
+    """Refuse scenes without points to start from.
+
+    Raises:
+        SceneError: If there are none, or training images see none of them.
+    """
+    if not _seen(scene, range(scene.num_periods)).any():
+        raise _no_points(scene.root)
+
+
+def _no_points(place: object) -> SceneError:
+    return SceneError(
+        place,
+        expected="sparse points that a training image sees",
+        found="none",
+        todo="triangulate some: chronoscene triangulate SCENE OUT",
+    )
+
+
 def training_frame(scene: Scene, periods: range | None = None) -> Sim3:
     """``training_from_world``: mean training camera at the origin, the farthest at distance 1.
 
@@ -201,19 +220,14 @@ def _training_set(
     frames, seen = _training_frames(scene, periods), _seen(scene, known)[:, : known.stop]
     kept = seen.any(axis=1)
     if not kept.any():
-        raise SceneError(
-            f"{scene.root}: period {known[-1]}" if len(known) == 1 else scene.root,
-            expected="sparse points that a training image sees",
-            found="none",
-            todo="triangulate points with COLMAP",
-        )
+        raise _no_points(f"{scene.root}: period {known[-1]}" if len(known) == 1 else scene.root)
     points = to_training.apply(scene.points.xyz[kept])
     if np.ptp(points, axis=0).max() < LEAST_SPREAD:
         raise SceneError(
             scene.root,
             expected="sparse points in different places",
             found=f"{len(points)} in one place",
-            todo="triangulate points with COLMAP",
+            todo="triangulate some: chronoscene triangulate SCENE OUT",
         )
     return TrainingSet(
         views=tuple(_training_view(f, store, to_training, hide_period) for f in frames),

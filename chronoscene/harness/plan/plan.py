@@ -17,7 +17,7 @@ from chronoscene.harness.plan.checks import check_run
 from chronoscene.harness.plan.finished import continued, is_to_do
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.memory import check_room, photo_needs
-from chronoscene.harness.plan.parts import check_scene, effective_strategy
+from chronoscene.harness.plan.parts import check_points, check_scene, effective_strategy
 from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun, resolve_method
 from chronoscene.harness.plan.settings import BenchSettings
 from chronoscene.images.store import ImageStore
@@ -100,6 +100,7 @@ def _read_scenes(settings: BenchSettings, log: Log) -> Iterable[Scene]:
             )
         scenes[scene.name] = scene
         check_scene(scene)
+        check_points(scene)
     return scenes.values()
 
 

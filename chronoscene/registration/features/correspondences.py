@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +42,12 @@ def _features(inputs: PhotoInputs, context: Context) -> dict[str, Any]:
     groups = camera_groups(inputs.images, options.camera_model, options.calibration)
     if inputs.scene is not None:
         groups = scene_groups(inputs.scene) + groups
+    return extract_features(groups, context)
+
+
+def extract_features(groups: Sequence[Mapping[str, Any]], context: Context) -> dict[str, Any]:
+    """Extract the features of groups of photos that share a camera; see `extraction.extract`."""
+    options = context.options
     settings = {
         "method": METHOD,
         "groups": groups,

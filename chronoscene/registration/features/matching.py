@@ -64,7 +64,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     listed = Path(arguments["scratch"]) / "batch.txt"
     for first in range(0, len(left), BATCH):
         report("pairs", len(pairs) - len(left) + first, len(pairs))
-        found = _store_matches(database, left[first : first + BATCH], mutual_matches, threads)
+        found = store_matches(database, left[first : first + BATCH], mutual_matches, threads)
         for least, share in INLIER_SHARES:
             write_pairs(listed, [pair for pair, count in found.items() if count >= least])
             found = {pair: count for pair, count in found.items() if count < least}
@@ -84,7 +84,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     }
 
 
-def _store_matches(
+def store_matches(
     database: str, pairs: Sequence[tuple[str, str]], matcher: Matcher, threads: int
 ) -> dict[tuple[str, str], int]:
     """Store matches of pairs of images, in the order of their ids, unless they are stored.

@@ -22,11 +22,19 @@ from chronoscene.arrays import Array, Ints
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import quiet, write_pairs
+from chronoscene.scene.geometry import camera_centre
 
 SPATIAL_NEIGHBOURS = 10
 SEQUENTIAL_NEIGHBOURS = 4
 SIMILAR_NEIGHBOURS = 6
 """Neighbours of each image in its period and, except in the sequence, in every other period."""
+
+POSED_NEIGHBOURS, POSED_CANDIDATES = 12, 60
+"""Neighbours of an image with a known pose in every period, and the nearest they are chosen of."""
+
+LEAST_COSINE = 0.25
+"""Of the angle between the directions of view of neighbours, 75 degrees. SIFT features are lost
+long before."""
 
 WORDS = 64
 MAX_TRAINING = 20_000
@@ -92,6 +100,27 @@ def spatial_pairs(enu: Array, periods: Ints) -> set[Pair]:
         _, nearest = cKDTree(enu[members, :2]).query(enu[known, :2], k=range(1, wanted + 1))
         for i, row in zip(known.tolist(), members[nearest].tolist(), strict=True):
             found += [(i, j) for j in row]
+    return _ordered(found)
+
+
+def posed_pairs(poses: Array, periods: Ints) -> set[Pair]:
+    """Pair images with the nearest of every period that look in a similar direction.
+
+    Args:
+        poses: cam_from_world. [N, 4, 4]
+        periods: [N]
+    """
+    from scipy.spatial import cKDTree
+
+    found: list[Pair] = []
+    centres, axes = camera_centre(poses), poses[:, 2, :3]
+    for target in np.unique(periods).tolist():
+        members = np.flatnonzero(periods == target)
+        wanted = min(POSED_CANDIDATES, len(members))
+        _, nearest = cKDTree(centres[members]).query(centres, k=range(1, wanted + 1))
+        for i, row in enumerate(members[nearest]):
+            alike = row[(axes[row] @ axes[i] > LEAST_COSINE) & (row != i)]
+            found += [(i, j) for j in alike[:POSED_NEIGHBOURS].tolist()]
     return _ordered(found)
 
 

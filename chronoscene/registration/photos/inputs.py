@@ -262,23 +262,9 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
     names, turned, converted = [], 0, 0
     plain = plain_names([c.name for c in captures])
     for capture, name in zip(captures, plain, strict=True):
-        target = folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if not _is_plain(capture.path):
-            target = target.with_name(f"{target.name}.png")
-            image, mask = load_photo(capture.path)
-            if mask is not None:
-                image[~mask] = 0  # nothing is to be found in what is transparent
-            with replacing(target) as partial:
-                Image.fromarray(image).save(partial, format="PNG")
-            converted += 1
-        elif capture.exif.orientation != 1 and capture.path.suffix.lower() in (".jpg", ".jpeg"):
-            data = capture.path.read_bytes()
-            with replacing(target) as partial:
-                partial.write_bytes(set_upright(data) or data)
-            turned += 1
-        else:
-            place_image(capture.path, target, "symlink")
+        target = place_photo(capture.path, folder / name, capture.exif.orientation)
+        converted += target != folder / name
+        turned += target == folder / name and not target.is_symlink()
         names.append(target.relative_to(folder).as_posix())
     remarks = []
     if turned:
@@ -288,6 +274,29 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
     if renamings := sum(a != c.name for a, c in zip(plain, captures, strict=True)):
         remarks.append(f"spaces in the names of {renamings} photos replaced by underscores")
     return names, remarks
+
+
+def place_photo(path: Path, target: Path, orientation: int | None) -> Path:
+    """Place a photo where COLMAP reads the pixels that we do, in colour.
+
+    Returns:
+        ``target``, with another extension if the photo is converted. A link, where that will do.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not _is_plain(path):
+        target = target.with_name(f"{target.name}.png")
+        image, mask = load_photo(path)
+        if mask is not None:
+            image[~mask] = 0  # nothing is to be found in what is transparent
+        with replacing(target) as partial:
+            Image.fromarray(image).save(partial, format="PNG")
+    elif orientation != 1 and path.suffix.lower() in (".jpg", ".jpeg"):
+        data = path.read_bytes()
+        with replacing(target) as partial:
+            partial.write_bytes(set_upright(data) or data)
+    else:
+        place_image(path, target, "symlink")
+    return target
 
 
 def plain_names(names: Sequence[str]) -> list[str]:

@@ -36,6 +36,14 @@ Agreements = Mapping[tuple[int, int], tuple[int, int]]
 
 def pair_agreements(model: pycolmap.Reconstruction, matches: Matches) -> Agreements:
     """Count the matches of each pair of posed images that lie near their epipolar lines."""
+    found = agreeing_matches(model, matches)
+    return {pair: (int(agreeing.sum()), len(agreeing)) for pair, agreeing in found.items()}
+
+
+def agreeing_matches(
+    model: pycolmap.Reconstruction, matches: Matches
+) -> dict[tuple[int, int], Mask]:
+    """Find the matches of each pair of posed images that lie near their epipolar lines. [M]"""
     posed = {int(i): model.images[i] for i in model.reg_image_ids()}
     rays, poses, focals = {}, {}, {}
     for i, image in posed.items():
@@ -53,7 +61,7 @@ def pair_agreements(model: pycolmap.Reconstruction, matches: Matches) -> Agreeme
             pixels = sampson_distance(relative, *uv, focal, focal)
             # Images from one place have no epipolar geometry that a match could contradict.
             agreeing = pixels < AGREEING_PIXELS if relative[:3, 3].any() else np.isnan(pixels)
-            found[a, b] = (int(agreeing.sum()), len(pairs))
+            found[a, b] = agreeing
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,14 @@ def set_pose(
     image = model.images[image_id]
     model.frames[image.frame_id].set_cam_from_world(image.camera_id, cam_from_world)
     model.register_frame(image.frame_id)
+
+
+def set_poses(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> set[int]:
+    """Register images at their poses, 3 x 4 by name, and return their ids."""
+    ids = {str(image.name): int(i) for i, image in model.images.items()}
+    for name, pose in poses.items():
+        set_pose(model, ids[name], pycolmap.Rigid3d(np.array(pose, np.float64)))
+    return {ids[name] for name in poses}
 
 
 def sorted_ids(model: pycolmap.Reconstruction) -> list[int]:

@@ -30,7 +30,7 @@ from chronoscene.registration.reconstruct.mapping import (
     register_rest,
     triangulate,
 )
-from chronoscene.registration.reconstruct.models import known_images, set_pose, summary
+from chronoscene.registration.reconstruct.models import known_images, set_poses, summary
 from chronoscene.registration.reconstruct.submodels import Combined, Submodel, combine
 
 MIN_POINTS = 50
@@ -161,7 +161,7 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     task = Task.start(arguments, report)
     poses = arguments["poses"]
     model = known_images(task.database)
-    old = _set_poses(model, poses)
+    old = set_poses(model, poses)
     _, matches = verified_matches(task.database)
     agreeing = agreement(pair_agreements(model, matches), old)
     if agreeing < MIN_AGREEMENT:
@@ -217,7 +217,7 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """
     task = Task.start(arguments, report)
     model = known_images(task.database)
-    for image_id in _set_poses(model, arguments["poses"]):
+    for image_id in set_poses(model, arguments["poses"]):
         image = model.images[image_id]
         model.cameras[image.camera_id].params = arguments["cameras"][str(image.name)]
     for i in range(2):
@@ -227,14 +227,6 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         adjust(model, threads=task.threads)
     task.remarks.append(f"adjusted with {len(arguments['ties'])} tie points")
     return task.finish(model)
-
-
-def _set_poses(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> set[int]:
-    """Register images at their poses, and return their ids."""
-    ids = {str(image.name): int(i) for i, image in model.images.items()}
-    for name, pose in poses.items():
-        set_pose(model, ids[name], pycolmap.Rigid3d(np.array(pose, np.float64)))
-    return {ids[name] for name in poses}
 
 
 def _max_change(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> float:

@@ -15,10 +15,11 @@ import numpy as np
 
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import counted
-from chronoscene.scene.splits import NameEntry, NameIndex, SplitEntry
+from chronoscene.scene.splits import NameEntry, NameIndex, SplitEntry, parse_split_text
 from chronoscene.validation.folder.names import PUNCTUATION, Spellings, spelling
 from chronoscene.validation.folder.observations import good_poses, observe
 from chronoscene.validation.rules.cs1_poses import UNIT_TOLERANCE
+from chronoscene.validation.rules.cs4_periods import doubtful_ids
 
 MIN_KEPT = 0.5
 """Share of the points that must have two observations; otherwise points without tracks are what the
@@ -104,7 +105,7 @@ def repair_split(
     data: bytes,
     text: str,
     names: Sequence[str],
-    entries: Sequence[SplitEntry],
+    labelled: Sequence[int] | None,
     others: Sequence[str] = (),
 ) -> tuple[str, dict[int, int], list[Repair]]:
     """A corrected ``split.txt``.
@@ -113,16 +114,16 @@ def repair_split(
         data: The file.
         text: The decoded file.
         names: Full names of the registered images.
-        entries: Its readable lines.
+        labelled: Ids in ``periods.json``; None if it is absent.
         others: Impossible image names in the model, whose lines stay.
 
     Returns:
         The new text; new ids by the old ones; what was done.
     """
     repairs = _line_repairs(data, text)
-    ids = sorted({entry.period for entry in entries})
-    new_ids = {old: new for new, old in enumerate(ids)}
-    if ids != list(range(len(ids))):
+    entries, problems = parse_split_text(text)
+    new_ids = _new_ids(entries, labelled, complete=not problems)
+    if any(old != new for old, new in new_ids.items()):
         listed = ", ".join(f"{old} is now {new}" for old, new in list(new_ids.items())[:10])
         repairs.append(Repair("CS401", f"periods numbered from 0: {listed}"))
     lines, unknown, twice, misspelt = _split_lines(text, names, entries, new_ids, others)
@@ -134,6 +135,15 @@ def repair_split(
     _note(repairs, "CS309", unknown, "line", "on images that are not in the model removed")
     _note(repairs, "CS308", twice, "repeated line", "removed")
     return "".join(f"{line}\n" for line in lines if line), new_ids, repairs
+
+
+def _new_ids(
+    entries: Sequence[SplitEntry], labelled: Sequence[int] | None, *, complete: bool
+) -> dict[int, int]:
+    """Number periods from 0, unless an id may be a typing error, or missing because of one."""
+    ids = sorted({entry.period for entry in entries})
+    certain = not doubtful_ids(entries) if labelled is None else sorted(labelled) == ids
+    return {old: new if certain and complete else old for new, old in enumerate(ids)}
 
 
 def _split_lines(
@@ -152,6 +162,9 @@ def _split_lines(
         if not fits and (name := _meant(spellings, entry.name)) is not None:
             by_line[number] = (entry, [name])
     used = {entry.period for entry, fits in by_line.values() if len(fits) == 1}
+    placed = {fits[0] for _, fits in by_line.values() if len(fits) == 1}
+    if set(names) - placed:
+        used = set()  # lines on unknown images may be about images without a line
     lines: list[str] = []
     unknown = twice = misspelt = 0
     done: set[tuple[str, int]] = set()

@@ -18,7 +18,7 @@ from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
-from chronoscene.scene.splits import parse_split_text, parse_test_text
+from chronoscene.scene.splits import parse_test_text
 from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.names import spelling
 from chronoscene.validation.folder.scene_folder import RawScene, TextFile, read_text_file
@@ -118,27 +118,30 @@ class _Fix:
         if text is None or names is None:
             return
         plain, repairs = contents.plain_table(text.text, names)
-        entries, _ = parse_split_text(plain)
         assert self._scene.images is not None
         others = sorted(set(self._scene.images.names) - set(names))
-        better, new_ids, more = contents.repair_split(text.data, plain, names, entries, others)
+        better, new_ids, more = contents.repair_split(
+            text.data, plain, names, self._labelled(), others
+        )
         repairs += more
         if not self._write(SPLIT, better):
             return
         self._repairs += repairs
-        if any(old != new for old, new in new_ids.items()):
-            self._number_periods(new_ids)
-
-    def _number_periods(self, new_ids: dict[int, int]) -> None:
-        """Renumber the labels of the periods, if they have exactly the old ids."""
-        try:
+        if any(old != new for old, new in new_ids.items()) and self._labelled() is not None:
             items = read_json_document(self._scene.root / PERIODS, list)
-            if [item["id"] for item in items] != sorted(new_ids):
-                return
             items = [{**item, "id": new_ids[item["id"]]} for item in items]
+            self._write(PERIODS, json.dumps(items, indent=1, ensure_ascii=False) + "\n")
+
+    def _labelled(self) -> list[int] | None:
+        """Ids in the file of labels; none if it is damaged, which has its own rule."""
+        place = self._scene.root / PERIODS
+        if not os.path.lexists(place):
+            return None
+        try:
+            ids = [item["id"] for item in read_json_document(place, list)]
         except (SceneError, TypeError, KeyError):
-            return  # absent, or has its own rule
-        self._write(PERIODS, json.dumps(items, indent=1, ensure_ascii=False) + "\n")
+            return []
+        return ids if all(type(i) is int for i in ids) and ids == sorted(ids) else []
 
     def _test(self, names: list[str] | None) -> None:
         text = self._find_text(TEST, TEST_ELSEWHERE, "CS322")

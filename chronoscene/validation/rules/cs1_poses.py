@@ -49,7 +49,7 @@ AXES = {"": np.ones(3), "OpenGL axes (y up, z backwards)": np.array([1.0, -1.0, 
 @rule.error(
     "CS121",
     bad="`nan` in a translation; quaternion `0 0 0 0`",
-    remedy="remove the image from the model, or register it again",
+    remedy=f"leave the image out ({rule.LEAVE_OUT}), or register it again",
 )
 def pose_not_finite(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     """A pose contains NaN or infinity, or its quaternion is zero."""
@@ -92,8 +92,8 @@ def far_from_origin(scene: RawScene, centres: Array) -> Iterator[Hit]:
 @rule.warning(
     "CS124",
     bad="a camera 3 km away from a square of 100 m",
-    remedy="check the pose: the image was probably registered in the wrong place; remove it from "
-    "the model or register it again",
+    remedy="check the pose: the image was probably registered in the wrong place; leave it out "
+    f"({rule.LEAVE_OUT}) or register it again",
 )
 def far_camera(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     """A camera is absurdly far from the other cameras and the points; methods that derive the size

@@ -31,7 +31,7 @@ KINDS = {
 @rule.error(
     "CS201",
     bad="`images.bin` has `a.jpg`, but there is only `images/a.JPG`",
-    remedy="copy the image there, or remove it from the model",
+    remedy=f"copy the image there, or leave it out ({rule.LEAVE_OUT})",
 )
 def image_missing(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     """The file of a registered image is missing."""
@@ -220,9 +220,7 @@ def image_transparent(readable: dict[str, Header]) -> Iterator[Hit]:
 
 
 @rule.warning(
-    "CS215",
-    bad="a PNG named `a.jpg`",
-    remedy="rename the file, in images/ and in the model, or convert it",
+    "CS215", bad="a PNG named `a.jpg`", remedy=f"rename the image ({rule.RENAME}), or convert it"
 )
 def image_misnamed(readable: dict[str, Header]) -> Iterator[Hit]:
     """The extension of an image does not match its file format; programs that go by the extension

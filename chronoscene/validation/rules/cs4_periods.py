@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from statistics import median
 
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted
@@ -18,29 +20,40 @@ MIN_OFF = 3  # Deviation from the fair share, in test views, that is worth a war
 UNEQUAL = 10  # Ratio between the numbers of training views of two periods
 
 
+RARE = 4  # Ratio of lines of the usual period to those of one whose id may be a typing error
+
+NUMBER = "number the periods from 0 without gaps; put labels and dates into sparse/periods.json"
 REGISTER_MORE = "register more images of this period"
 
 
-@rule.error(
-    "CS401",
-    bad="ids 2016 and 2023; ids 0 and 2",
-    remedy="number the periods from 0 without gaps; put labels and dates into sparse/periods.json",
-)
+@rule.error("CS401", bad="ids 2016 and 2023; ids 0 and 2", remedy=NUMBER)
 def period_ids(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
     """The period ids are not 0..T-1."""
     if not split and any(p.kind in ("fields", "period") for p in scene.split_problems):
         return  # no line could be read, which has its own rules
     if names_on_bad_lines(scene):
         return  # periods may be missing because of these lines
+    doubtful = doubtful_ids(split)
     for problem in check_period_ids(split, {entry.period for entry in split}):
         hit = problem_hit(SPLIT, problem)
-        yield Hit(hit.place, hit.expected, hit.found)
+        if not doubtful:
+            yield Hit(hit.place, hit.expected, hit.found)
+        for line in (entry.line for entry in split if entry.period in doubtful):
+            place, todo = f"{SPLIT}:{line}", f"correct the id if it is wrong; else {NUMBER}"
+            yield Hit(place, hit.expected, f"{hit.found}; few lines have the id of this one", todo)
+
+
+def doubtful_ids(split: Sequence[SplitEntry]) -> set[int]:
+    """Find ids of so few lines that they may be typing errors."""
+    counts = Counter(entry.period for entry in split)
+    usual = median(counts.values()) if counts else 0
+    return {period for period, n in counts.items() if n == 1 or RARE * n < usual}
 
 
 @rule.error(
     "CS402",
     bad="COLMAP could not register any photo of period 2",
-    remedy="register images of this period, or remove it and renumber the others",
+    remedy="register images of this period, or delete its lines and number the others from 0",
     needs=("images",),
 )
 def period_empty(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:

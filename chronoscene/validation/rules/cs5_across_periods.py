@@ -24,7 +24,7 @@ UNIT_TOLERANCE = 0.1
 @rule.warning(
     "CS506",
     bad="points of period 0 only; the images of period 1 were added later",
-    remedy="triangulate points with the images of this period",
+    remedy=f"triangulate points with the images of this period ({rule.TRIANGULATE})",
 )
 def period_without_points(scene: RawScene, point_periods: Mask) -> Iterator[Hit]:
     """No point is seen in any image of a period."""

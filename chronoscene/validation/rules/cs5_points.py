@@ -25,7 +25,7 @@ FAR = 100.0
 
 
 @rule.error(
-    "CS501", bad="an empty `points3D.txt`", remedy="triangulate points (colmap point_triangulator)"
+    "CS501", bad="an empty `points3D.txt`", remedy=f"triangulate points ({rule.TRIANGULATE})"
 )
 def no_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
     """The model has no points, but methods start from them. Benchmarks refuse the scene."""
@@ -33,7 +33,9 @@ def no_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
         yield Hit(scene.model_file("points3D"), "sparse points", "none")
 
 
-@rule.error("CS502", bad="`nan` in `points3D.txt`", remedy="remove the points from the model")
+@rule.error(
+    "CS502", bad="`nan` in `points3D.txt`", remedy="chronoscene validate --fix removes the points"
+)
 def point_not_finite(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
     """The coordinates of a point are NaN or infinite."""
     bad = np.asarray(~np.isfinite(points.xyz).all(axis=1))
@@ -129,7 +131,8 @@ def image_without_points(
 @rule.warning(
     "CS510",
     bad="a keypoint at `nan nan` in a track",
-    remedy="remove these observations; they come from pixels that cannot be undistorted",
+    remedy="chronoscene validate --fix removes these observations; they come from pixels that "
+    "cannot be undistorted",
 )
 def observation_not_finite(
     scene: RawScene, images: RawImages, observations: Observations
@@ -146,7 +149,7 @@ def observation_not_finite(
 @rule.error(
     "CS514",
     bad="points seen only in test images",
-    remedy="triangulate points (colmap point_triangulator), or change the split",
+    remedy=f"triangulate points ({rule.TRIANGULATE}), or change the split",
 )
 def no_training_points(
     scene: RawScene, images: RawImages, observations: Observations, tests: set[str]
@@ -187,7 +190,8 @@ def far_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
 @rule.warning(
     "CS522",
     bad="a model triangulated without colours: all points are black",
-    remedy="extract the colours (colmap color_extractor) and write the model again",
+    remedy="extract the colours (colmap color_extractor) and write the model again, or triangulate "
+    f"new points ({rule.TRIANGULATE})",
 )
 def points_without_colours(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
     """Nearly all points have the same colour, which is useless to methods that start from the

@@ -42,7 +42,7 @@ _ROWS = 256
 @rule.error(
     "CS601",
     bad="`a.jpg` and its copy `a_copy.jpg`, one of them in `test.txt`",
-    remedy="remove one of the images from the model",
+    remedy=f"leave one of the images out ({rule.LEAVE_OUT})",
 )
 def leak_train_test(scene: RawScene, tests: set[str]) -> Iterator[Hit]:
     """A test image is also a training image (same bytes or, with `--decode`, same pixels)."""
@@ -58,7 +58,8 @@ def leak_train_test(scene: RawScene, tests: set[str]) -> Iterator[Hit]:
 @rule.error(
     "CS602",
     bad="a folder of 2016 copied into the folder of 2023",
-    remedy="keep the image in the period in which it was taken",
+    remedy="keep the image in the period in which it was taken, and leave the other one out "
+    f"({rule.LEAVE_OUT})",
 )
 def leak_periods(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
     """One photo is in two periods (same bytes or, with `--decode`, same pixels)."""
@@ -70,7 +71,9 @@ def leak_periods(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
 
 
 @rule.warning(
-    "CS603", bad="`a.jpg` and `a_copy.jpg`", remedy="remove one of the images from the model"
+    "CS603",
+    bad="`a.jpg` and `a_copy.jpg`",
+    remedy=f"leave one of the images out ({rule.LEAVE_OUT})",
 )
 def image_twice(scene: RawScene, periods: dict[str, int], tests: set[str]) -> Iterator[Hit]:
     """One photo is there twice, in one period and twice in train or twice in test."""
@@ -83,7 +86,7 @@ def image_twice(scene: RawScene, periods: dict[str, int], tests: set[str]) -> It
 @rule.warning(
     "CS604",
     bad="a training image, and the same photo saved again as JPEG for testing",
-    remedy="look at both; remove one if it is a copy that was saved again",
+    remedy=f"look at both; if one is a copy that was saved again, leave it out ({rule.LEAVE_OUT})",
 )
 def near_leak(
     scene: RawScene, periods: dict[str, int], tests: set[str], pixels: dict[str, Pixels]
@@ -116,7 +119,7 @@ def _apart(scene: RawScene, a: str, b: str) -> str:
 @rule.warning(
     "CS605",
     bad="a burst of three photos, the second of which is in `test.txt`",
-    remedy="remove one of the two, or make the test image a training image",
+    remedy=f"leave one of the two out ({rule.LEAVE_OUT}), or make the test image a training image",
 )
 def pose_leak(scene: RawScene, images: RawImages, tests: set[str]) -> Iterator[Hit]:
     """A test image has the pose of a training image of its period, so it measures memorisation

@@ -69,7 +69,7 @@ def official_failure(line: str) -> str | None:
 @rule.warning(
     "CS702",
     bad="`x/0001.png` and `y/0001.png`; `a.1.png` and `a.2.png`; `0001.jpg` and `0001.png`",
-    remedy="give all images different file names up to the first dot",
+    remedy=f"give all images different file names up to the first dot ({rule.RENAME})",
 )
 def official_name_collision(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     """Two images are the same to the official loader, which identifies them by their file name up

@@ -8,7 +8,12 @@ import pytest
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.harness.files.strategies import STRATEGIES
-from chronoscene.harness.plan.parts import effective_strategy, make_parts, training_frame
+from chronoscene.harness.plan.parts import (
+    check_points,
+    effective_strategy,
+    make_parts,
+    training_frame,
+)
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import load_spec
 from chronoscene.scene import Period, Points
@@ -311,6 +316,16 @@ def test_methods_without_period_run_pooled_with_a_notice():
     assert effective_strategy(mean, "joint") == ("joint", None)
     with pytest.raises(ConfigError, match="joint, pooled, separate"):
         effective_strategy(mean, "together")
+
+
+def test_scenes_without_points_are_refused(make_scene):
+    scene = make_scene()
+    check_points(scene)
+    seen = np.zeros(len(scene.points.track_frame), bool)
+    rank = np.arange(len(scene.frames), dtype=np.int32)
+    check_points(replace(scene, points=scene.points.select_observations(seen, rank)))
+    with pytest.raises(SceneError, match="found none; triangulate some: chronoscene triangulate"):
+        check_points(replace(scene, points=Points.empty()))
 
 
 def test_points_in_one_place_are_refused(make_scene):

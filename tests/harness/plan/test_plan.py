@@ -1,13 +1,20 @@
 """Plans: whose overrides they are, and what a run differs in."""
 
 import shutil
+from dataclasses import replace
+
+import pytest
 
 from chronoscene import methods
+from chronoscene.errors import SceneError
+from chronoscene.formats import chronoscene as our_format
+from chronoscene.formats import read_scene
 from chronoscene.harness.plan import resolve
 from chronoscene.harness.plan.finished import first_difference
 from chronoscene.harness.plan.plan import plan_runs
 from chronoscene.harness.plan.settings import RunSettings, bench_settings
 from chronoscene.harness.use.trained_run import open_run
+from chronoscene.scene import Points
 
 
 def test_differences_are_named():
@@ -35,6 +42,14 @@ def test_planning_builds_each_configuration_once(scene_folder, tmp_path, monkeyp
     settings = bench_settings((scene_folder,), names, tmp_path / "runs", seeds=(0, 1))
     assert len(plan_runs(settings, lambda line: None).runs) == 4
     assert sorted(built) == ["blind", "blind", "mean", "mean"]
+
+
+def test_a_scene_without_points_is_refused_before_anything_starts(scene_folder, tmp_path):
+    bare = replace(read_scene(scene_folder), points=Points.empty())
+    our_format.write(bare, tmp_path / "bare")
+    settings = bench_settings((tmp_path / "bare",), ("toy_methods:MEAN",), tmp_path / "runs")
+    with pytest.raises(SceneError, match="found none; triangulate some: chronoscene triangulate"):
+        plan_runs(settings, lambda line: None)
 
 
 def test_periods_that_the_user_names_hold_for_the_whole_run(

@@ -121,6 +121,33 @@ def test_what_only_people_can_decide_stays(scene, fix, lines, remains):
     assert (out / SPLIT).read_text().splitlines()[-len(lines) :] == lines
 
 
+TYPING_ERRORS = {
+    "a digit too many": (lambda t: t.replace("a001.png 0", "a001.png 12"), "CS401"),
+    "a letter": (lambda t: t.replace("a001.png 0", "a001.png O"), "CS304"),
+    "a letter in all lines of a period": (lambda t: t.replace(".png 0", ".png O"), "CS304"),
+    "a number after the id": (lambda t: t.replace("a001.png 0", "a001.png 0 1"), "CS305"),
+}
+
+
+@pytest.mark.parametrize("case", TYPING_ERRORS)
+def test_a_typing_error_does_not_become_a_period(scene, fix, case):
+    change, code = TYPING_ERRORS[case]
+    scene.write(SPLIT, change(scene.path(SPLIT).read_text()))
+    wrong = scene.path(SPLIT).read_text()
+    fixed, after, out = fix()
+    assert fixed == set() and code in after
+    assert (out / SPLIT).read_text() == wrong
+
+
+def test_ids_that_contradict_the_labels_stay(scene, fix):
+    scene.write(SPLIT, scene.path(SPLIT).read_text().replace(".png 0", ".png 2"))
+    labels = [{"id": 0, "label": "before"}, {"id": 1, "label": "after"}]
+    scene.write("sparse/periods.json", json.dumps(labels))
+    _, after, out = fix()
+    assert "CS401" in after and {line[-1] for line in scene.lines(SPLIT)} == {"1", "2"}
+    assert (out / SPLIT).read_text() == scene.path(SPLIT).read_text()
+
+
 def test_labels_follow_their_periods(scene, fix):
     SPLITS["gaps"][0](scene)
     labels = [{"id": 3, "label": "before"}, {"id": 7, "label": "after"}]

@@ -12,6 +12,14 @@ def test_period_ids(scene, ids):
     scene.expect("CS401", place=SPLIT, found=f"{ids[0]}, {ids[1]}")
 
 
+def test_an_id_of_one_line_may_be_a_typing_error(scene):
+    scene.write(SPLIT, [line.replace("a001.png 0", "a001.png 12") for line in scene.lines(SPLIT)])
+    also = {"CS404", "CS405"}
+    report = scene.expect("CS401", place=f"{SPLIT}:2", found="0, 1, 12; few lines", also=also)
+    (finding,) = [f for f in report.findings if f.code == "CS401"]
+    assert finding.remedy.startswith("correct the id if it is wrong; else number the periods")
+
+
 def test_empty_split(scene):
     scene.write(SPLIT, "")
     scene.expect("CS401", place=SPLIT, found="none", also={"CS305"})

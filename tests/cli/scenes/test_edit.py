@@ -1,0 +1,71 @@
+"""``chronoscene edit`` and ``chronoscene triangulate`` on the command line."""
+
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli, main
+from chronoscene.formats import read_scene
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
+
+
+def test_says_what_is_left(make_scene_folder, tmp_path):
+    periods = {f"{p}/{i}.png": j for j, p in enumerate("ab") for i in range(3)}
+    folder = make_scene_folder(periods, tests=["a/0.png"])
+    result = run(
+        "edit", folder, tmp_path / "out", "--drop", "b/0.png", "--keep-period", "1",
+        "--rename", "1=after", "--crop=-100,-100,-100,100,100,100", "--link", "hard",
+    )  # fmt: skip
+    assert result.exit_code == 0
+    assert "2 images, 1 camera, 30 points, 1 period" in result.stdout
+    assert "period 0 (after): 2 train, 0 test\n4 images left out\n" in result.stdout
+    assert "points left out: none" in result.stdout
+    assert "there are no test images" in result.stderr
+    (frame, _) = read_scene(tmp_path / "out").frames
+    assert (tmp_path / "out/images" / frame.name).samefile(folder / "images" / frame.name)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "give something to do"),
+        (["--crop", "1,2,3"], "--crop: expected six numbers"),
+        (["--crop", "1,1,1,0,2,2"], "--crop: expected six numbers"),
+        (["--rename", "a"], "--rename: expected KEY=VALUE, found 'a'"),
+        (["--drop", "a/002.png"], "did you mean 'a/0002.png'?"),
+    ],
+)
+def test_errors(make_scene_folder, tmp_path, monkeypatch, capsys, arguments, message):
+    words = ["chronoscene", "edit", str(make_scene_folder()), str(tmp_path / "out"), *arguments]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", [("edit", "--drop", "a/0001.png"), ("triangulate",)])
+def test_never_into_the_scene(make_scene_folder, monkeypatch, capsys, command):
+    folder = make_scene_folder()
+    name, *options = command
+    monkeypatch.setattr(sys, "argv", ["chronoscene", name, str(folder), f"{folder}/out", *options])
+    with pytest.raises(SystemExit):
+        main()
+    assert "a place outside the scene" in capsys.readouterr().err
+
+
+def test_photos_without_common_features(make_scene_folder, tmp_path, monkeypatch, capsys):
+    words = ["triangulate", str(make_scene_folder()), str(tmp_path / "out"), "--threads", "1"]
+    monkeypatch.setattr(sys, "argv", ["chronoscene", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert "at least 50 points, found 0: " in lines[-1] and "add images that overlap" in lines[-1]
+    assert "was kept" in lines[-2]
+    assert not (tmp_path / "out").exists()
