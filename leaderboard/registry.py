@@ -1,4 +1,4 @@
-"""What the board knows by itself: titles of methods, scenes with their hashes, lengths of presets.
+"""Names that the board knows by itself: methods and their titles, scenes and their hashes.
 
 An entry does not say how its method is called in tables, and cannot give a name that is taken to
 something else.

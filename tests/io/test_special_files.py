@@ -48,7 +48,7 @@ def make(path, kind):
 )
 def test_a_file_that_is_none(tmp_path, kind, read):
     path = make(tmp_path / "a.json", kind)
-    with pytest.raises((ChronoSceneError, OSError), match="a pipe or device|a link"):
+    with pytest.raises((ChronoSceneError, OSError), match=r"a pipe or device|a link"):
         read(path)
 
 

@@ -14,6 +14,7 @@ import pytest
 from made_runs import write_scored
 
 from chronoscene.errors import CheckpointError, SceneError
+from chronoscene.harness.files.predictions import read_manifest, write_manifest
 from chronoscene.harness.report.published import load_published
 from leaderboard.board import NOT_ASKED, read_board
 from leaderboard.scenes import FixedScene, views_hash
@@ -55,7 +56,7 @@ def standings(folder, claimed=""):
 def lawncourt():
     """A scene of the paper, as if its hashes were known."""
     views = [(f"{i}/view{k}.png", i) for i in range(2) for k in range(3)]
-    scene = FixedScene("ranking", "", "a" * 64, "b" * 64, views_hash(views))
+    scene = FixedScene("ranking", "", "d" * 64, "b" * 64, views_hash(views))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("leaderboard.scenes.fixed_scenes", lambda: {"Lawncourt": scene})
         yield
@@ -67,14 +68,17 @@ def runs(tmp_path_factory):
         write_scored,
         tmp_path_factory.mktemp("x") / "runs",
         scene="square",
-        scene_hash="d" * 64,
         period_labels={"0": NASTY, "1": "late"},
     )
     make(), make(seed=1)
     better = ((28.0, 29.0, 30.0), (31.0, 32.0, 33.0))
     make("chronogs", psnr=better, seconds=20.0, checkpoint_bytes=500_000)
     make("lab-method", psnr=better, seconds=30.0)  # nobody installed this one
-    return make("4dgs", scene="Lawncourt", scene_hash="a" * 64).parents[2]
+    run = make("4dgs", scene="Lawncourt", scene_hash="d" * 64)
+    for folder in (run / "predictions", run.parents[2] / "ground_truth/Lawncourt"):
+        manifest = read_manifest(folder).model_copy(update={"scene_hash": "d" * 64})
+        write_manifest(folder, manifest)
+    return run.parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +127,7 @@ def test_the_board_gives_titles_and_only_methods_that_are_installed_have_command
     make_run, enter, tmp_path
 ):
     make_run(title="ChronoGS"), make_run("chronogs-official", title="x", variant="prefix=sudo")
-    make_run("3dgs", preset="mine", config_hash="e" * 64)
+    make_run("3dgs", 1, preset="mine", config_hash="e" * 64)
     enter([tmp_path / "runs"], tmp_path / "e")
     write_site(standings(tmp_path / "e"), load_published(), tmp_path / "site")
     page = (tmp_path / "site/method/3dgs.html").read_text(encoding="utf-8")
@@ -188,7 +192,10 @@ def test_all_numbers_of_the_paper_are_on_a_page(site):
 
 def test_scenes_of_one_name_have_rows_of_their_own(make_run, enter, tmp_path):
     enter([make_run()], tmp_path / "e")
-    enter([make_run(split_hash="f" * 64, psnr=((11.0, 12.0), (13.0, 14.0)))], tmp_path / "e")
+    enter(
+        [make_run(split_hash="f" * 64, psnr=((11.0, 12.0, 11.5), (13.0, 14.0, 13.5)))],
+        tmp_path / "e",
+    )
     write_site(standings(tmp_path / "e"), load_published(), tmp_path / "site")
     for page in ("index.html", "scene/square.html", "method/3dgs.html"):
         text = (tmp_path / "site" / page).read_text(encoding="utf-8")
@@ -219,7 +226,7 @@ def test_times_of_devices_have_columns_of_their_own(make_run, enter, tmp_path):
     write_site(standings(tmp_path / "e"), load_published(), tmp_path / "site")
     page = tmp_path / "site/scene/square.html"
     head = Page(page).rows[0]
-    assert "training [s], cpu (Test, 2 threads)" in head and "training [s], cuda (Test)" in head
+    assert "reported, cpu (Test, 2 threads)" in head and "reported, cuda (Test)" in head
     assert "code: 1111111111-dirty" in page.read_text()
 
 
