@@ -1,22 +1,26 @@
 """Measured results, as files that anybody may hand in: one per method, setting and machine.
 
-An entry has the values of all test views, from which means, intervals and ties follow, so that none
-of these has to be believed; and the hashes of the images that were scored. Nothing in an entry is
-trusted: what is not a number of a plausible size or a plain text is refused.
+An entry has the values of all test views, from which means, intervals and ties follow, and the
+hashes of the images that were scored, which lie beside it (`predictions_folder`). Nothing in it is
+trusted: what cannot be true is refused here, and the rest is a claim until the images have been
+scored again (`leaderboard.verification`).
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from chronoscene.errors import ConfigError
+from chronoscene.harness.files.predictions import MANIFEST
 from chronoscene.harness.files.records import RunRecord, ViewScore
+from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.report.comparable import KEY
 from chronoscene.harness.report.summary import COSTS
 from chronoscene.harness.score.regions import ALL
@@ -24,17 +28,18 @@ from chronoscene.harness.score.scoring import aggregate
 from chronoscene.io.documents import plain_file
 from chronoscene.io.staging import leads_out
 from chronoscene.metrics.registry import all_metrics
+from leaderboard.registry import check_effort, check_scene
 
-MAX_BYTES = 50_000_000
-"""Largest entry. A thousand views with ten metrics and ten seeds have less than ten million."""
-MAX_VALUE = 1e3
-"""Largest absolute value of a metric."""
+MAX_BYTES = 10_000_000
+"""Largest file of an entry. A thousand views with three metrics and ten seeds have 3,000,000."""
+MAX_RUNS, MAX_VIEWS, MAX_PERIODS = 30, 2_000, 200
 MAX_COST = 1e15
-"""Largest absolute value of any other number."""
+"""Largest absolute value of a number that is no metric."""
 
-_NAME = re.compile(r"\w[\w .,:+@()-]{0,99}")
+_NAME = re.compile(r"\w[\w .,:+@()-]{0,99}", re.ASCII)
+_VARIANT = re.compile(r"(\w+=[\w.,+:() -]+(,\w+=[\w.,+:() -]+)*)?", re.ASCII)
+_WORDS = re.compile("publish|verif|claim|measure", re.IGNORECASE)  # of the board
 _HASH = re.compile(r"[0-9a-f]{64}")
-_NOT_TEXT = re.compile(r"[<\x00-\x1f\x7f]")
 
 Sha256 = Annotated[str, Field(pattern=f"^{_HASH.pattern}$")]
 
@@ -45,7 +50,7 @@ class ScoredView(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     view: str
-    period: int
+    period: int = Field(ge=0, lt=MAX_PERIODS)
     sha256: Sha256
     """Hash of the predicted image."""
     values: dict[str, float]
@@ -58,36 +63,28 @@ class EntryRun(BaseModel):
 
     record: RunRecord
     """``run.json``, without regions and stages."""
-    views: tuple[ScoredView, ...]
+    views: tuple[ScoredView, ...] = Field(max_length=MAX_VIEWS)
 
     @model_validator(mode="after")
     def _plausible(self) -> EntryRun:
-        _check_values(self.model_dump())
         record = self.record
-        for name in ("scene", "method", "strategy", "preset"):
-            if not _NAME.fullmatch(getattr(record, name)):
-                raise ValueError(f"{name} is no plain name: {getattr(record, name)!r}")
-        for name in ("scene_hash", "split_hash", "config_hash"):
-            if not _HASH.fullmatch(getattr(record, name)):
-                raise ValueError(f"{name} is no SHA-256")
-        for cost in COSTS:
-            if (getattr(record, cost.name) or 0) < 0:
-                raise ValueError(f"{cost.name} is negative")
-        if any(leads_out(view.view) for view in self.views):
-            raise ValueError("the name of a view leads out of its folder")
-        if len({view.view for view in self.views}) < len(self.views):
-            raise ValueError("a view twice")
-        if unknown := {name for view in self.views for name in view.values} - {*all_metrics()}:
-            raise ValueError(f"unknown metrics: {', '.join(sorted(unknown))}")
-        if "validation=true" in record.variant.split(","):
-            raise ValueError("scores of validation views: run bench without --validation")
+        _check_texts(record)
+        _check_numbers(record)
+        _check_views(self.views)
         if record.regions or record.stages or record.transfer:
             raise ValueError("regions and stages are no part of an entry")
         if not _agree((record.aggregates, record.periods), aggregate(self.rows)):
             raise ValueError("the means are not those of the views")
         if not record.periods or not record.periods.keys() <= record.period_labels.keys():
             raise ValueError("a period without a label, or no period")
+        check_effort(record)
+        check_scene(record, [(view.view, view.period) for view in self.views])
         return self
+
+    @property
+    def images(self) -> dict[str, str]:
+        """Hash of the prediction of each view."""
+        return {view.view: view.sha256 for view in self.views}
 
     @property
     def rows(self) -> list[ViewScore]:
@@ -108,7 +105,7 @@ class MeasuredEntry(BaseModel):
     kind: Literal["measured"] = "measured"
     outdated: bool = False
     """True for results of older code: its presets, or what it made of them, have changed since."""
-    runs: tuple[EntryRun, ...] = Field(min_length=1)
+    runs: tuple[EntryRun, ...] = Field(min_length=1, max_length=MAX_RUNS)
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> MeasuredEntry:
@@ -117,6 +114,10 @@ class MeasuredEntry(BaseModel):
                 raise ValueError(f"runs that differ in {name}")
         if len({run.record.seed for run in self.runs}) < len(self.runs):
             raise ValueError("a seed twice")
+        for one, other in combinations(self.runs, 2):
+            if {*one.images.items()} & {*other.images.items()}:
+                seeds = f"{one.record.seed} and {other.record.seed}"
+                raise ValueError(f"seeds {seeds} have the same image of a view")
         return self
 
     @property
@@ -124,23 +125,16 @@ class MeasuredEntry(BaseModel):
         """Values that differ between entries."""
         return tuple(getattr(self.runs[0].record, name) for name in KEY)
 
-    @property
-    def records(self) -> list[RunRecord]:
-        """Runs, with their rows; the title of a method says if its code is outdated."""
-        mark = " of older code" if self.outdated else ""
-        return [
-            run.record.model_copy(update={"rows": run.rows, "title": run.record.title + mark})
-            for run in self.runs
-        ]
-
 
 def read_entry(path: Path) -> MeasuredEntry:
     """Read a measured entry.
 
     Raises:
-        ConfigError: If it is anything else, or not plausible.
+        ConfigError: If it is anything else, or cannot be true.
     """
     try:
+        if path.is_symlink():
+            raise refused(path, "a link")
         if path.stat().st_size > MAX_BYTES:
             raise refused(path, f"more than {MAX_BYTES} bytes")
         return MeasuredEntry.model_validate_json(plain_file(path).read_bytes())
@@ -150,20 +144,14 @@ def read_entry(path: Path) -> MeasuredEntry:
         raise refused(path, error.strerror or str(error)) from error
 
 
-def read_entries(folder: Path) -> dict[Path, MeasuredEntry]:
-    """Read all entries below a folder, by file.
+def entry_files(folder: Path) -> list[Path]:
+    """Return all files below a folder that should be entries, sorted."""
+    return sorted(path for path in folder.rglob("*.json") if path.name != MANIFEST)
 
-    Raises:
-        ConfigError: If one is refused, or two are of the same runs.
-    """
-    entries: dict[Path, MeasuredEntry] = {}
-    keys = set()
-    for path in sorted(folder.rglob("*.json")):
-        entry = entries[path] = read_entry(path)
-        if entry.key in keys:
-            raise refused(path, "an entry of the same method and setting as in another file")
-        keys.add(entry.key)
-    return entries
+
+def predictions_folder(entry: Path, seed: int) -> Path:
+    """Return where the predictions of a seed are, with their manifest: beside the entry."""
+    return entry.with_suffix("") / f"seed{seed}"
 
 
 def refused(place: Path, found: str) -> ConfigError:
@@ -195,20 +183,52 @@ def _leaves(value: Any) -> Iterator[Any]:
         yield from _leaves(item)
 
 
-def _check_values(document: dict[str, Any]) -> None:
-    record = document["record"]
-    metrics = [record["aggregates"], record["periods"], [v["values"] for v in document["views"]]]
-    _check_numbers(_leaves(metrics), MAX_VALUE)
-    _check_numbers(_leaves(document), MAX_COST)
-    for leaf in _leaves(document):
-        if isinstance(leaf, str) and (_NOT_TEXT.search(leaf) or len(leaf) > 1000):
+def _check_texts(record: RunRecord) -> None:
+    for name in ("scene", "method", "title", "strategy", "preset"):
+        if not _NAME.fullmatch(text := getattr(record, name)) or _WORDS.search(text):
+            raise ValueError(f"{name} is no plain name: {text[:60]!r}")
+    if record.strategy not in STRATEGIES:
+        raise ValueError(f"unknown strategy: {record.strategy}")
+    if not _VARIANT.fullmatch(record.variant) or _WORDS.search(record.variant):
+        raise ValueError(f"variant is no list of options: {record.variant[:60]!r}")
+    if "validation=true" in record.variant.split(","):
+        raise ValueError("scores of validation views: run bench without --validation")
+    for name in ("scene_hash", "split_hash", "config_hash"):
+        if not _HASH.fullmatch(getattr(record, name)):
+            raise ValueError(f"{name} is no SHA-256")
+    for leaf in _leaves(record.model_dump()):
+        if isinstance(leaf, str) and (not leaf.isprintable() or "<" in leaf or len(leaf) > 1000):
             raise ValueError(f"a text with markup, control characters or too long: {leaf[:60]!r}")
+    if len(record.device) > 100 or len(record.commit) > 100:
+        raise ValueError("a text too long: device or commit")
 
 
-def _check_numbers(leaves: Iterable[Any], largest: float) -> None:
-    for leaf in leaves:
-        if isinstance(leaf, int | float) and not abs(leaf) <= largest:  # NaN is refused, too
+def _check_numbers(record: RunRecord) -> None:
+    for leaf in _leaves(record.model_dump()):
+        if isinstance(leaf, int | float) and not abs(leaf) <= MAX_COST:  # NaN is refused, too
             raise ValueError(f"a number that cannot be: {str(leaf)[:20]}")
+    for cost in COSTS:
+        if (getattr(record, cost.name) or 0) < 0:
+            raise ValueError(f"{cost.name} is negative")
+    if record.max_width < 1:
+        raise ValueError("max_width is not positive")
+
+
+def _check_views(views: tuple[ScoredView, ...]) -> None:
+    known = all_metrics()
+    for view in views:
+        if leads_out(view.view) or not view.view.isprintable() or len(view.view) > 200:
+            raise ValueError("the name of a view leads out of its folder, or is no plain text")
+        if view.values.keys() != views[0].values.keys():
+            raise ValueError("views with other metrics than the first one")
+        if unknown := view.values.keys() - known.keys():
+            raise ValueError(f"unknown metrics: {', '.join(sorted(unknown))[:100]!r}")
+        for name, value in view.values.items():
+            low, high = known[name].bounds
+            if not low <= value <= high:
+                raise ValueError(f"{name} that cannot be: {str(value)[:20]}")
+    if len({view.view for view in views}) < len(views):
+        raise ValueError("a view twice")
 
 
 def _agree(claimed: Any, computed: Any) -> bool:

@@ -11,8 +11,8 @@ from PIL import Image
 from chronoscene.formats.shared.grouping import natural_key
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import ImageEntry, load_image, read_manifest
-from chronoscene.harness.files.records import PREDICTIONS, RunRecord, read_run, run_folders
-from leaderboard.entries import MeasuredEntry
+from chronoscene.harness.files.records import PREDICTIONS, read_run, run_folders
+from leaderboard.board import Standing
 
 VIEWS = 3
 """Views of each period, spread over its test views."""
@@ -21,18 +21,15 @@ WIDTH = 640
 QUALITY = 82
 
 
-def find_runs(folders: Iterable[Path], entries: Iterable[MeasuredEntry]) -> dict[Path, RunRecord]:
+def find_runs(folders: Iterable[Path], standings: Iterable[Standing]) -> dict[Path, Standing]:
     """Find the folders of runs with the predictions of the first seed of an entry."""
-    wanted = {
-        frozenset((view.view, view.sha256) for view in entry.runs[0].views): entry.records[0]
-        for entry in entries
-    }
+    wanted = {frozenset(s.entry.runs[0].images.items()): s for s in standings}
     found = {}
     for run in (run for folder in folders for run in run_folders(folder)):
         hashes = frozenset((image.view, image.sha256) for image in _own(run / PREDICTIONS))
         if (known := wanted.get(hashes)) is not None:
-            record = read_run(run)
-            if (known.scene_hash, known.config_hash) == (record.scene_hash, record.config_hash):
+            record, entered = read_run(run), known.records[0]
+            if (entered.scene_hash, entered.config_hash) == (record.scene_hash, record.config_hash):
                 found[run] = known
     return found
 

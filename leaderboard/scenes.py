@@ -9,10 +9,12 @@ makes the generated ones in FOLDER, checks those that are there, and names those
 from __future__ import annotations
 
 import argparse
+import hashlib
 import sys
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -41,16 +43,25 @@ class FixedScene:
     """One line."""
     scene_hash: str
     split_hash: str
+    views_hash: str
+    """By `views_hash`."""
     synth: dict[str, Any] | None = None
     """Settings that generate it; None if it is made by hand."""
     made: str = ""
     """Its source and the commands, if it is made by hand."""
 
 
+@cache
 def fixed_scenes() -> dict[str, FixedScene]:
     """Read the table: scenes by name."""
     text = Path(__file__).with_name("scenes.toml").read_text(encoding="utf-8")
     return {name: FixedScene(**fields) for name, fields in tomllib.loads(text).items()}
+
+
+def views_hash(views: Iterable[tuple[str, int]]) -> str:
+    """Hash the test views of a scene: SHA-256 over the sorted lines ``name TAB period``."""
+    lines = sorted(f"{name}\t{period}\n" for name, period in views)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def role_of(digest: str) -> str:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import re
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from chronoscene.harness.files.predictions import load_image, read_manifest
+from chronoscene.harness.files.ground_truth import truth_of
+from chronoscene.harness.files.predictions import read_manifest, write_manifest
 from chronoscene.harness.files.records import (
     PREDICTIONS,
     RUN_FILE,
@@ -18,46 +20,74 @@ from chronoscene.harness.files.records import (
     run_folders,
 )
 from chronoscene.harness.score.regions import ALL
-from chronoscene.io.staging import write_text_atomic
+from chronoscene.harness.score.scoring import score_folder
+from chronoscene.io.staging import needing_space, partial_name, write_text_atomic
+from chronoscene.metrics.registry import make_scorers
 from leaderboard.entries import (
     EntryRun,
     MeasuredEntry,
     ScoredView,
-    read_entries,
+    predictions_folder,
+    read_entry,
     reason_of,
     refused,
 )
+from leaderboard.verification import check_values
 
 
 def submit(folders: Iterable[Path], to: Path) -> list[Path]:
     """Add runs to the entries of a folder; a run of a seed that is there replaces it.
+
+    The predictions are scored again, and copied beside the entry: without them nobody could verify
+    it. Those of other periods than that of the photo are left out.
 
     Args:
         folders: Of single runs, or of many.
         to: Folder of entries; made if there is none.
 
     Returns:
-        The files that were written.
+        The files of entries that were written.
 
     Raises:
         CheckpointError: If a run is damaged, or its images are not those that its manifest lists.
-        ConfigError: If a run is not plausible, or an entry that is there is not.
+        ConfigError: If a run cannot be what it says, or the file of an entry that is there.
     """
-    entries = read_entries(to)
-    places = {entry.key: path for path, entry in entries.items()}
-    changed = {}
+    entries: dict[Path, MeasuredEntry] = {}
+    sources: dict[Path, Path] = {}
     for folder in (run for given in folders for run in _runs_of(given)):
-        entry = MeasuredEntry(runs=(entry_run(folder),))
-        path = places.setdefault(entry.key, to / file_name(entry))
-        known = entries.get(path, entry)
-        by_seed = {run.record.seed: run for run in (*known.runs, *entry.runs)}
+        run = entry_run(folder)
+        path = to / file_name(run)
+        known = entries.get(path) or (read_entry(path) if path.exists() else None)
+        by_seed = {r.record.seed: r for r in (*(known.runs if known else ()), run)}
         runs = tuple(by_seed[seed] for seed in sorted(by_seed))
-        entries[path] = MeasuredEntry(outdated=known.outdated, runs=runs)
-        changed[path] = entries[path]
-    for path, entry in changed.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            entries[path] = MeasuredEntry(outdated=known is not None and known.outdated, runs=runs)
+        except ValidationError as error:
+            raise refused(folder, reason_of(error)) from error
+        sources[predictions_folder(path, run.record.seed)] = folder / PREDICTIONS
+    for place, source in sources.items():
+        _copy_predictions(source, place)
+    for path, entry in entries.items():
         write_text_atomic(path, entry.model_dump_json(indent=1) + "\n")
-    return [*changed]
+    return [*entries]
+
+
+def _copy_predictions(source: Path, place: Path) -> None:
+    """Copy the images of the periods of their photos, with their manifest, in place of others."""
+    manifest = read_manifest(source)
+    images = tuple(i for i in manifest.images if i.rendered_period == i.camera_period)
+    partial = place.with_name(partial_name(place.name))
+    try:
+        with needing_space(place):
+            for image in images:
+                target = partial / image.file
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source / image.file, target)
+            write_manifest(partial, manifest.model_copy(update={"images": images}))
+        shutil.rmtree(place, ignore_errors=True)
+        partial.rename(place)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _runs_of(folder: Path) -> list[Path]:
@@ -82,10 +112,8 @@ def entry_run(folder: Path) -> EntryRun:
     images = {i.view: i for i in manifest.images if i.rendered_period == i.camera_period}
     if images.keys() != values.keys():
         raise refused(folder, "other views in its rows than among its predictions")
-    for image in images.values():
-        load_image(predictions, image)  # checks the hash
     try:
-        return EntryRun(
+        run = EntryRun(
             record=record.model_copy(update={"regions": {}, "stages": {}, "transfer": {}}),
             views=tuple(
                 ScoredView(view=view, period=i.camera_period, sha256=i.sha256, values=values[view])
@@ -94,11 +122,15 @@ def entry_run(folder: Path) -> EntryRun:
         )
     except ValidationError as error:
         raise refused(folder, reason_of(error)) from error
+    scorers = make_scorers({row.metric for row in run.rows})
+    check_values(folder, run, score_folder(predictions, truth_of(folder.resolve()), scorers))
+    return run
 
 
-def file_name(entry: MeasuredEntry) -> str:
+def file_name(entry: EntryRun) -> str:
     """Return a readable and unique name for the file of an entry, below a folder per scene."""
-    run = entry.runs[0].record
+    run = entry.record
     words = run.scene, "-".join((run.method, run.strategy, run.preset))
     scene, plain = (re.sub(r"[^\w.-]+", "_", text)[:100] for text in words)
-    return f"{scene}/{plain}-{hashlib.sha256(repr(entry.key).encode()).hexdigest()[:8]}.json"
+    key = MeasuredEntry(runs=(entry,)).key
+    return f"{scene}/{plain}-{hashlib.sha256(repr(key).encode()).hexdigest()[:8]}.json"

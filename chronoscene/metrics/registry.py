@@ -39,6 +39,8 @@ class MetricInfo:
     """True if it is computed only where it is named."""
     package: str = ""
     """Package that it needs and that may be missing, as it is imported."""
+    bounds: tuple[float, float] = (-1e3, 1e3)
+    """Least and largest value that a view can have; the leaderboard refuses others."""
 
 
 ENTRY_POINT_GROUP = "chronoscene.metrics"
@@ -53,6 +55,7 @@ METRICS = {
             "images; means are means of decibels",
             higher_is_better=True,
             decimals=2,
+            bounds=(0.0, 100.0),
         ),
         MetricInfo(
             "ssim",
@@ -61,6 +64,7 @@ METRICS = {
             "variant of 3DGS and of the papers that follow it",
             higher_is_better=True,
             decimals=4,
+            bounds=(-1.0, 1.0),
         ),
         MetricInfo(
             "ssim_valid",
@@ -69,6 +73,7 @@ METRICS = {
             "scikit-image with gaussian_weights, sigma 1.5, use_sample_covariance False",
             higher_is_better=True,
             decimals=4,
+            bounds=(-1.0, 1.0),
         ),
         MetricInfo(
             "lpips_vgg",
@@ -76,6 +81,7 @@ METRICS = {
             "LPIPS 0.1 with VGG16 on inputs in [-1, 1], as its authors define it",
             higher_is_better=False,
             decimals=4,
+            bounds=(0.0, 2.0),
         ),
         MetricInfo(
             "lpips_vgg_3dgs",
@@ -84,6 +90,7 @@ METRICS = {
             "follow it",
             higher_is_better=False,
             decimals=4,
+            bounds=(0.0, 2.0),
         ),
         MetricInfo(
             "psnr_cc",
@@ -92,6 +99,7 @@ METRICS = {
             "nearest to its photo",
             higher_is_better=True,
             decimals=2,
+            bounds=(0.0, 100.0),
             function=psnr_cc,
             on_request=True,
         ),
@@ -101,6 +109,7 @@ METRICS = {
             "as ssim, after the same map of the colours",
             higher_is_better=True,
             decimals=4,
+            bounds=(-1.0, 1.0),
             function=ssim_cc,
             on_request=True,
         ),
@@ -110,6 +119,7 @@ METRICS = {
             "mean LDR-FLIP at 67 pixels per degree, by the package of its authors",
             higher_is_better=False,
             decimals=4,
+            bounds=(0.0, 1.0),
             function=flip,
             on_request=True,
             package="flip_evaluator",

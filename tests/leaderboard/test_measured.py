@@ -9,10 +9,11 @@ from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.resolve import resolve_method
 from chronoscene.harness.plan.settings import RunSettings
 from chronoscene.methods import installed_methods, load_spec
-from leaderboard.entries import read_entries
+from leaderboard.entries import entry_files, read_entry
 from leaderboard.scenes import fixed_scenes
 
-ENTRIES = read_entries(Path(leaderboard.__file__).parent / "entries/measured")
+FOLDER = Path(leaderboard.__file__).parent / "entries/measured"
+ENTRIES = {path: read_entry(path) for path in entry_files(FOLDER)}
 EACH = pytest.mark.parametrize("path", ENTRIES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 
 

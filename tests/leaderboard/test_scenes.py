@@ -47,12 +47,14 @@ def table(monkeypatch, tmp_path) -> dict[str, FixedScene]:
     """A table of one tiny scene, made once, and one that is made by hand."""
     pytest.importorskip("open3d")
     settings = asdict(preset("tiny", views=4, points=100, seed=5))
-    tiny = FixedScene("tuning", "tiny", "0" * 64, "0" * 64, synth=settings)
+    tiny = FixedScene("tuning", "tiny", "0" * 64, "0" * 64, "0" * 64, synth=settings)
     with pytest.raises(SceneError, match="expected scene 0000000000, split 0000000000, found"):
         make(tmp_path / "tiny", tiny)
     scene = read_scene(tmp_path / "tiny")
     tiny = replace(tiny, scene_hash=scene_hash(scene), split_hash=split_hash(scene))
-    hand = FixedScene("ranking", "by hand", "1" * 64, "1" * 64, made="register the photos")
+    hand = FixedScene(
+        "ranking", "by hand", "1" * 64, "1" * 64, "1" * 64, made="register the photos"
+    )
     table = {"tiny": tiny, "hand": hand}
     monkeypatch.setattr(scenes, "fixed_scenes", lambda: table)
     return table

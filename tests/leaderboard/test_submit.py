@@ -1,36 +1,41 @@
 """Runs become entries, if their images are those that were scored."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import pytest
 
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.harness.files.records import read_rows, read_run, write_run
-from leaderboard.entries import read_entries
+from chronoscene.harness.score.scoring import aggregate
+from leaderboard.board import read_board
+from leaderboard.entries import predictions_folder, read_entry
 from leaderboard.submit import submit
 
 
-def test_seeds_extend_an_entry_and_replace_themselves(make_run, tmp_path):
+def test_seeds_extend_an_entry_and_replace_themselves(make_run, enter, tmp_path):
     to = tmp_path / "entries"
-    first = submit([make_run()], to)
-    assert submit([make_run(seed=1)], to) == first
-    assert submit([make_run(psnr=((30.0, 31.0), (32.0, 33.0)))], to) == first
-    (entry,) = read_entries(to).values()
-    assert [(r.seed, r.periods["0"]["psnr"]) for r in entry.records] == [(0, 30.5), (1, 21.0)]
+    first = enter([make_run()], to)
+    assert enter([make_run(seed=1)], to) == first
+    assert enter([make_run(psnr=((30.0, 31.0, 32.0), (32.0, 33.0, 34.0)))], to) == first
+    entry = read_entry(first[0])
+    found = [(r.record.seed, r.record.periods["0"]["psnr"]) for r in entry.runs]
+    assert found == [(0, 31.0), (1, 21.0)]
 
 
-def test_a_folder_of_runs_gives_an_entry_per_setting(make_run, tmp_path):
+def test_a_folder_of_runs_gives_an_entry_per_setting(make_run, enter, tmp_path):
     make_run(), make_run("chronogs"), make_run("chronogs", seed=1)
     make_run("4dgs", device="cuda (Test)")
-    written = submit([tmp_path / "runs"], tmp_path / "entries")
+    written = enter([tmp_path / "runs"], tmp_path / "entries")
     assert len({*written}) == 3
-    assert [len(entry.runs) for entry in read_entries(tmp_path / "entries").values()] == [1, 1, 2]
+    assert sorted(len(read_entry(path).runs) for path in written) == [1, 1, 2]
 
 
-def test_devices_have_entries_of_their_own(make_run, tmp_path):
-    submit([make_run()], tmp_path / "entries")
-    submit([make_run(device="cuda (Test)")], tmp_path / "entries")
-    assert len(read_entries(tmp_path / "entries")) == 2
+def test_devices_have_entries_of_their_own(make_run, enter, tmp_path):
+    enter([make_run()], tmp_path / "entries")
+    enter([make_run(device="cuda (Test)")], tmp_path / "entries")
+    assert len(read_board(tmp_path / "entries").standings) == 2
 
 
 def test_a_changed_prediction_is_refused_and_nothing_is_written(make_run, tmp_path):
@@ -70,3 +75,28 @@ def test_a_run_with_changed_means_is_refused(make_run, tmp_path):
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(CheckpointError, match="expected a finished run, found no such file"):
         submit([tmp_path], tmp_path / "entries")
+
+
+def test_values_that_are_not_those_of_the_images_are_refused(honest, tmp_path):
+    shutil.copytree(honest / "runs", tmp_path / "runs")
+    run = tmp_path / "runs/yard/4dgs-joint-fast/seed0"
+    record, rows = read_run(run), read_rows(run)
+    rows = [replace(row, value=row.value + (row.metric == "psnr")) for row in rows]
+    record.aggregates, record.periods = aggregate(rows)
+    write_run(run, record, rows)
+    with pytest.raises(ConfigError, match=r"seed 0: psnr 1\d\.\d* for '0/0.png', whose image has"):
+        submit([run], tmp_path / "entries")
+    assert not (tmp_path / "entries").exists()
+
+
+def test_predictions_are_copied_with_their_manifest(honest, tmp_path):
+    run = honest / "runs/yard/3dgs-joint-fast/seed1"
+    (path,) = submit([run], tmp_path / "entries")
+    there = predictions_folder(path, 1)
+    names = {file.relative_to(there) for file in there.rglob("*") if file.is_file()}
+    assert {str(name) for name in names} == {
+        "manifest.json",
+        *(f"{i}/{k}.png.png" for i in (0, 1) for k in (0, 2)),
+    }
+    assert (there / "manifest.json").read_text() == (run / "predictions/manifest.json").read_text()
+    assert len(read_board(tmp_path / "entries", [honest / "yard"]).standings) == 1

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import click
 
 from chronoscene.cli.options import EXISTING_FOLDER, FOLDER, RUNS
-from chronoscene.cli.output import check_place, report_written, writing_to
+from chronoscene.cli.output import check_place, report_written, say, writing_to
+from chronoscene.cli.progress import progress_bar
 from chronoscene.harness.report.published import load_published
-from leaderboard.entries import read_entries
+from leaderboard.board import read_board
 from leaderboard.site import write_site
 from leaderboard.submit import submit
 
@@ -26,8 +28,9 @@ def submit_command(folders: tuple[Path, ...], to: Path) -> None:
     """Add finished runs to the entries of the leaderboard.
 
     RUNS are folders of single runs or of many. An entry is a JSON file with the values of all test
-    views, the costs of the runs, and the hashes of the predictions, which are checked. Seeds of one
-    setting share a file; a seed that is already there is replaced.
+    views and the costs of the runs, and a folder of their predictions beside it. The predictions
+    are scored again with the frozen ground truth, and a run with other values is refused. Seeds of
+    one setting share a file; a seed that is already there is replaced.
     """
     with writing_to("--to", to):
         written = submit(folders, to)
@@ -38,21 +41,43 @@ def submit_command(folders: tuple[Path, ...], to: Path) -> None:
 @click.argument("entries", type=EXISTING_FOLDER)
 @click.option("--out", type=FOLDER, required=True, help="New folder for the site.")
 @click.option(
+    "--verify",
+    "scenes",
+    multiple=True,
+    type=EXISTING_FOLDER,
+    help="Folder of a scene: the predictions of its entries are scored again, against its own test "
+    "photos. May be repeated.",
+)
+@click.option(
     "--runs",
     multiple=True,
     type=EXISTING_FOLDER,
     help="Folder of the runs that entries were made of: pictures of their test views come from "
     "there. May be repeated.",
 )
-def leaderboard_command(entries: Path, out: Path, runs: tuple[Path, ...]) -> None:
+def leaderboard_command(
+    entries: Path, out: Path, scenes: tuple[Path, ...], runs: tuple[Path, ...]
+) -> None:
     """Build the site of the leaderboard.
 
-    ENTRIES is a folder of measured entries; published figures are shown beside them. The site needs
-    no server: open its index.html.
+    ENTRIES is a folder of measured entries. Those whose predictions have been scored again, with
+    --verify, are ranked; the others stand below as claimed. Entries that cannot be true, or whose
+    values are not those of their predictions, are left out with a notice. Published figures are
+    shown beside them. The site needs no server: open its index.html.
     """
     check_place("--out", out)
-    found = [*read_entries(entries).values()]
-    pictured = write_site(found, load_published(), out, runs)
-    outdated = sum(entry.outdated for entry in found)
-    click.echo(f"{len(found)} measured entries: {outdated} of older code, {pictured} with pictures")
+    with progress_bar() as bar:
+        board = read_board(entries, scenes, progress=bar if scenes else None)
+    pictured = write_site(board.standings, load_published(), out, runs)
+    for notice in board.notices:
+        say(notice, fg="yellow")
+    claimed = Counter(standing.claimed for standing in board.standings)
+    verified = claimed.pop("", 0)
+    outdated = sum(standing.entry.outdated for standing in board.standings)
+    click.echo(
+        f"{len(board.standings)} measured entries: {verified} verified, {claimed.total()} claimed, "
+        f"{outdated} of older code, {pictured} with pictures"
+    )
+    for reason, number in claimed.items():
+        click.echo(f"claimed: {number}: {reason}")
     report_written(out / "index.html")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import struct
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -22,6 +23,7 @@ from chronoscene.io.staging import replacing, write_text_atomic
 
 MANIFEST = "manifest.json"
 
+_PNG = b"\x89PNG\r\n\x1a\n"
 _UNSAFE = re.compile(r'[%<>:"|?*\\\x00-\x1f\x7f]')
 
 
@@ -259,7 +261,7 @@ def _load_png(
         raise CheckpointError(
             path, expected="an image", found="no such file", todo="run bench again"
         )
-    data = path.read_bytes()
+    data = path.read_bytes() if path.stat().st_size <= _largest_png(size) else b""
     if hashlib.sha256(data).hexdigest() != sha256:
         raise CheckpointError(
             path,
@@ -267,8 +269,17 @@ def _load_png(
             found="another file",
             todo="the image was changed after rendering: delete the run and run bench again",
         )
+    if not data.startswith(_PNG):  # nothing else is decoded
+        raise damaged(path, "no image")
+    if struct.unpack(">II", data[16:24].ljust(8, b"\0")) != (size[1], size[0]):
+        raise damaged(path, "an image of another size")
     mode = cv2.IMREAD_COLOR if color else cv2.IMREAD_GRAYSCALE
     image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
-    if image is None or image.shape[:2] != size:
-        raise damaged(path, "an image of another size" if image is not None else "no image")
+    if image is None:
+        raise damaged(path, "no image")
     return np.asarray(image, np.uint8)
+
+
+def _largest_png(size: tuple[int, int]) -> int:
+    """Return bytes that no PNG file of this height and width exceeds, even uncompressed."""
+    return 8 * size[0] * size[1] + 1_000_000

@@ -50,14 +50,20 @@ def setting_of(run: RunRecord) -> Setting:
 
 def effort_of(run: RunRecord) -> str:
     """Describe the effort that a run was allowed, all models together."""
-    options = dict(part.partition("=")[::2] for part in run.variant.split(","))
-    if budget := re.fullmatch(r"(\d+(?:\.\d+)?(?:e\+\d+)?)s", options.get("budget", "")):
-        each = options.get("separate_iterations") == "each" and run.strategy != "pooled"
-        seconds = float(budget[1]) * (len(run.period_labels) if each else 1)
+    if (seconds := budget_of(run)) is not None:
         return f"{seconds:g}s of training on {run.device}"
     if run.iterations is None:  # another program, which did not say
         return f"preset {run.preset}"
     return f"{run.iterations:,} training steps"
+
+
+def budget_of(run: RunRecord) -> float | None:
+    """Return the seconds that a run was allowed, all models together; None if steps end it."""
+    options = dict(part.partition("=")[::2] for part in run.variant.split(","))
+    if budget := re.fullmatch(r"(\d+(?:\.\d+)?(?:e\+\d+)?)s", options.get("budget", "")):
+        each = options.get("separate_iterations") == "each" and run.strategy != "pooled"
+        return float(budget[1]) * (len(run.period_labels) if each else 1)
+    return None
 
 
 def comparable(runs: Iterable[RunRecord]) -> dict[Setting, list[RunRecord]]:

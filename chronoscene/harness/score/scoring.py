@@ -175,7 +175,7 @@ def match_views(
     """Pair every test view, or those of a stage, with its prediction.
 
     Raises:
-        CheckpointError: If the scene, a view or a size differs.
+        CheckpointError: If the scene, a view, its size or its period differs.
     """
     if predicted.scene_hash != truth.scene_hash:
         raise _mismatch(folder, f"scene {truth.scene_hash[:12]}", predicted.scene_hash[:12])
@@ -188,6 +188,9 @@ def match_views(
         if (mine.width, mine.height) != (target.width, target.height):
             size = f"{target.width} x {target.height} pixels for {view!r}"
             raise _mismatch(folder, size, f"{mine.width} x {mine.height}")
+        if mine.camera_period != target.camera_period:
+            period = f"period {target.camera_period} for the camera of {view!r}"
+            raise _mismatch(folder, period, f"period {mine.camera_period}")
     return [(by_view[view], target) for view, target in targets.items()]
 
 

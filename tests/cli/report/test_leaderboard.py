@@ -4,6 +4,8 @@ from click.testing import CliRunner
 from made_runs import write_scored
 
 from chronoscene.cli import cli
+from chronoscene.harness.score.scoring import rescore
+from chronoscene.metrics.registry import make_scorers
 
 
 def invoke(*args):
@@ -11,12 +13,18 @@ def invoke(*args):
 
 
 def test_from_a_run_to_a_site(tmp_path):
-    write_scored(tmp_path / "runs")
+    write_scored(tmp_path / "runs", scene="square")
+    rescore(tmp_path / "runs", make_scorers(["psnr"]))
     done = invoke("submit", tmp_path / "runs", "--to", tmp_path / "entries")
     assert done.exit_code == 0, done.output
     (entry,) = (tmp_path / "entries").iterdir()
     assert f"wrote {entry}" in done.stderr
+    (tmp_path / "entries/bad.json").write_text("{}")
     done = invoke("leaderboard", tmp_path / "entries", "--out", tmp_path / "site")
     assert done.exit_code == 0, done.output
-    assert done.stdout == "1 measured entries: 0 of older code, 0 with pictures\n"
-    assert (tmp_path / "site/scene/plaza.html").is_file()
+    assert done.stdout.splitlines() == [
+        "1 measured entries: 0 verified, 1 claimed, 0 of older code, 0 with pictures",
+        "claimed: 1: its scene was not named by --verify",
+    ]
+    assert f"left out: {tmp_path}/entries/bad.json: expected a measured entry" in done.stderr
+    assert (tmp_path / "site/scene/square.html").is_file()

@@ -7,7 +7,7 @@ for (const button of document.querySelectorAll(".sort")) {
     for (const other of table.querySelectorAll("thead th")) other.removeAttribute("aria-sort");
     head.setAttribute("aria-sort", order);
     const sign = order === "ascending" ? 1 : -1;
-    // Published rows have a body of their own, and stay below the measured ones.
+    // Claimed and published rows have bodies of their own, and stay below the verified ones.
     for (const body of table.tBodies) {
       const rows = [...body.rows].filter((row) => !row.matches(".kind"));
       const key = (row) => row.cells[column].dataset.value;
