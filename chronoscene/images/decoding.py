@@ -78,7 +78,7 @@ def load_opaque(path: Path, *, size: tuple[int, int] | None = None) -> NDArray[n
     """
     pixels = load_rgb(path, size=size)
     with Image.open(path) as image:
-        if is_transparent(image) and image.convert("RGBA").getextrema()[3][0] < 255:
+        if is_transparent(image) and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
             raise ImageError(
                 path,
                 expected="an image without transparent pixels",
@@ -154,7 +154,7 @@ def _orientation(image: Image.Image) -> int:
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
-    """Return width and height of the pixels as stored: Pillow's size of a TIFF is after rotation."""
+    """Return width and height of the pixels as stored; Pillow gives those of a rotated TIFF."""
     width, height = image.size
     turned = image.format == "TIFF" and _orientation(image) >= 5
     return (height, width) if turned else (width, height)

@@ -154,9 +154,7 @@ def test_waiting_for_photos_is_off_the_clock_and_counted(part, clock):
 
 
 @pytest.mark.parametrize(
-    ("computed", "seconds"),
-    [(0.5, 2.5), (4.0, 42.25)],
-    ids=["stopped", "computing"],
+    ("computed", "seconds"), [(0.5, 2.5), (4.0, 42.25)], ids=["stopped", "computing"]
 )
 def test_a_pause_of_the_process_is_off_the_clock_and_counted(part, clock, computed, seconds):
     method, work = toy(), type(clock)()
