@@ -39,7 +39,9 @@ def least(amounts: Tensor, share: float) -> Tensor:
     """Return True for the smallest amounts, which make up no more than a share of their sum."""
     values, order = amounts.flatten().double().sort(stable=True)
     found = torch.zeros_like(order, dtype=torch.bool)
-    found[order] = values.cumsum(0) <= share * values.sum()
+    # Sums in order, the last one included: those by `sum` depend on the number of threads.
+    sums = values.cumsum(0)
+    found[order] = sums <= share * sums[-1:]
     return found.view(amounts.shape)
 
 

@@ -110,7 +110,7 @@ def run_job(job: Job, report: Report | None = None) -> None:
     final = ImageWriter(staging / records.PREDICTIONS)
     method, outcomes = _new_method(run), []
     with ProgressDisplay(job.label, report=report, models=len(parts)) as display:
-        display.wait("warm-up: kernels compile at first use, for a minute or more")
+        display.wait("warm-up: seconds, or minutes where kernels are not compiled yet")
         before = time.perf_counter()
         periods = parts[0].train.num_periods
         notice = warm_up(run.spec, run.config, num_periods=periods, device=machine.device)
