@@ -154,14 +154,14 @@ class AnchorMethod(SplattingMethod):
     def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
         return bake(self.model, self._weights(period), views)
 
-    def draw_splats(self, splats: Splats, view: View) -> Rasterization:
+    def draw_splats(self, splats: Splats, view: View, *, plain: bool = False) -> Rasterization:
         layout = self._model.layout
         return draw(
             splats,
             view,
             self.background,
             near_plane=layout.near_plane,
-            antialiased=layout.antialiased,
+            antialiased=layout.antialiased and not plain,
             render_depth=True,
         )
 

@@ -111,13 +111,13 @@ class GaussianMethod(SplattingMethod):
         tensors = (p["means"], p["quats"], scales, opacities, sh_coeffs)
         return GaussianCloud(*(tensor.cpu().numpy() for tensor in tensors))
 
-    def draw_splats(self, splats: Splats, view: View) -> Rasterization:
+    def draw_splats(self, splats: Splats, view: View, *, plain: bool = False) -> Rasterization:
         return draw(
             splats,
             view,
             self.background,
             near_plane=self.config.near_plane,
-            antialiased=self.config.antialiased,
+            antialiased=self.config.antialiased and not plain,
             render_depth=True,
         )
 

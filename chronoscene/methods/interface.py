@@ -215,8 +215,27 @@ class Method(Protocol):
             In the training frame, in float32.
         """
 
-    def render_gaussians(self, gaussians: GaussianCloud, view: View) -> Prediction:
-        """Render what `to_gaussians` gave."""
+    def render_gaussians(
+        self, gaussians: GaussianCloud, view: View, *, plain: bool = False
+    ) -> Prediction:
+        """Render what `to_gaussians` gave.
+
+        Args:
+            gaussians: In the training frame.
+            view: The camera.
+            plain: Leave out the antialiasing filter of the training, as viewers without it do.
+                Never true for methods whose options have no ``antialiased``.
+        """
+
+    def adapt_to_plain(self, gaussians: GaussianCloud, views: Sequence[View]) -> GaussianCloud:
+        """Change Gaussians so that renderers without the antialiasing filter show about the same.
+
+        Only where `to_gaussians` gives Gaussians that need the filter.
+
+        Args:
+            gaussians: What `to_gaussians` gave.
+            views: Training views in which the result is to be right.
+        """
 
     def permute(self, order: NDArray[np.int64]) -> None:
         """Put the anchors or Gaussians of a loaded model into another order. [N]

@@ -21,6 +21,7 @@ from chronoscene.rasterizer.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     CLAMP_MARGIN,
+    EPS2D,
     EXTENT_MAX,
     QUATERNION_MIN,
     RADIUS_MAX,
@@ -194,6 +195,26 @@ def _seen(opacities: Tensor, axes: Tensor, inputs: Inputs) -> Tensor:
 def _compensations(axes: Tensor, eps2d: float) -> Tensor:
     """sqrt(det Sigma' / det Sigma) with Sigma' the covariance before the blur. [M]"""
     return torch.sqrt(_determinants(axes, 0.0) / _determinants(axes, eps2d))
+
+
+def filter_factors(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    eps2d: float = EPS2D,
+) -> Tensor:
+    """Compute what the antialiasing filter multiplies opacities by in one view. [M]
+
+    Without meaning for Gaussians that are not in front of the camera. Arguments as
+    `chronoscene.rasterizer.rasterize`, for one camera.
+    """
+    projected = _project(means, quats, scales, viewmat, K, width, height)
+    return _compensations(projected.axes, eps2d)
 
 
 def _visible(projected: _Projected, extents: Tensor, inputs: Inputs) -> Tensor:

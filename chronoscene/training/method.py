@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -30,6 +30,7 @@ from chronoscene.training.checkpoint import (
 from chronoscene.training.config import SplattingConfig
 from chronoscene.training.drawing import Splats, camera_centre_tensor, prediction_of
 from chronoscene.training.exposure import Exposure, exposed, of_period
+from chronoscene.training.filtering import adapt_to_plain
 from chronoscene.training.periods import with_new_periods
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, evaluate
 
@@ -84,8 +85,8 @@ class SplattingMethod(ABC):
         """Build the initial model; return its trainer."""
 
     @abstractmethod
-    def draw_splats(self, splats: Splats, view: View) -> Rasterization:
-        """Render Gaussians by the rules of the model, with depth."""
+    def draw_splats(self, splats: Splats, view: View, *, plain: bool = False) -> Rasterization:
+        """Render Gaussians by the rules of the model, with depth; if plain, without the filter."""
 
     @abstractmethod
     def splats(self, view: View, period: float, appearance_period: float) -> Splats:
@@ -154,14 +155,20 @@ class SplattingMethod(ABC):
         return replace(gaussians, sh_coeffs=exposed(gaussians.sh_coeffs, exposure))
 
     @torch.no_grad()
-    def render_gaussians(self, gaussians: GaussianCloud, view: View) -> Prediction:
+    def render_gaussians(
+        self, gaussians: GaussianCloud, view: View, *, plain: bool = False
+    ) -> Prediction:
         device = self.background.device
-        arrays = (getattr(gaussians, field.name) for field in fields(gaussians))
-        means, quats, scales, opacities, sh = (torch.from_numpy(a).to(device) for a in arrays)
+        means, quats, scales, opacities, sh = gaussians.tensors(str(device)).values()
         centre = camera_centre_tensor(view, device)
         colors = evaluate(sh[:, 0], sh[:, 1:], means, centre, MAX_DEGREE)
         splats = Splats(means, quats, scales, opacities, colors)
-        return prediction_of(self.draw_splats(splats, view))
+        return prediction_of(self.draw_splats(splats, view, plain=plain))
+
+    @torch.no_grad()
+    def adapt_to_plain(self, gaussians: GaussianCloud, views: Sequence[View]) -> GaussianCloud:
+        near_plane = self.config.near_plane
+        return adapt_to_plain(gaussians, views, near_plane, self.background.device)
 
     def exposure(self) -> Tensor | None:
         """Return the transform of colours of each period, if any are learned. [T, 3, 4]"""

@@ -1,53 +1,237 @@
-"""Quality lost where a finished run is exported as Gaussians."""
+"""Gaussians of finished runs in files for other programs, and what these will show."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from chronoscene import __version__, splat_files
+from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
+from chronoscene.io.wording import counted
 from chronoscene.metrics.psnr_ssim import psnr
-from chronoscene.scene import Scene
+from chronoscene.scene import Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.orbit import find_up
+
+LIMIT_DB = 0.3
+"""PSNR that plain viewers may lose on the training views, for them to be the default."""
+FAR_AWAY = 2_000.0
+"""Coordinate of the median camera, in units of the scene, beyond which an offset is subtracted."""
 
 
 class ExportLoss(NamedTuple):
-    """Means over the test views of the period, in dB."""
+    """Means over views of one period, in dB."""
 
     views: int
     model: float
     """PSNR of the images that the run renders."""
-    exported: float
-    """PSNR of the Gaussians that were exported."""
+    plain: float
+    """PSNR of the Gaussians in a viewer without the antialiasing filter."""
+    filtered: float | None
+    """PSNR of the Gaussians with the filter; None if the run was trained without it."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Gaussians of a period as they go into files."""
+
+    cloud: GaussianCloud
+    """In the frame of the scene minus `offset`."""
+    offset: NDArray[np.float64]
+    """Position in the scene minus position in the file. [3]"""
+    antialiased: bool
+    """True if viewers have to use the antialiasing filter."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """A file with the Gaussians of a period."""
+
+    data: bytes
+    loss: ExportLoss | None
+    """On the test views, of the Gaussians as they are read from the file; None if no test photo
+    shows the period."""
+    comments: tuple[str, ...]
+    """Lines on content and losses; they are in the file, where its format has a place for them."""
+
+
+def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = None) -> Prepared:
+    """Take the Gaussians of a period out of a run.
+
+    Args:
+        run: A finished run.
+        scene: The scene that it was trained on.
+        period: Period of the Gaussians.
+        viewers: ``plain`` for viewers without the antialiasing filter, ``antialiased`` for those
+            with it; None for plain ones if that loses less than `LIMIT_DB` on the training views.
+
+    Raises:
+        ConfigError: If there are no Gaussians, or the run has no filter.
+    """
+    if viewers == "antialiased" and not _is_filtered(run):
+        raise ConfigError(
+            "--for antialiased",
+            expected="a run that was trained with the filter of antialiased",
+            found="one without it",
+            todo="leave it out",
+        )
+    offset = local_offset(scene)
+    cloud = run.gaussians(period, scene=scene, offset=offset)
+    if not len(cloud):
+        raise ConfigError(
+            f"period {period:g}",
+            expected="Gaussians",
+            found="none",
+            todo="train the run for longer, or choose another period",
+        )
+    if viewers == "antialiased" or not _is_filtered(run):
+        return Prepared(cloud, offset, antialiased=viewers == "antialiased")
+    return _adapted(run, scene, period, Prepared(cloud, offset, antialiased=True), viewers)
+
+
+def make_file(
+    run: TrainedRun, scene: Scene, period: float, prepared: Prepared, kind: str
+) -> Export:
+    """Make a file of what `prepare` gave, and measure it as it is read.
+
+    Args:
+        run: The run.
+        scene: Its scene.
+        period: As for `prepare`.
+        prepared: What `prepare` gave.
+        kind: Format, of `chronoscene.splat_files.SUFFIXES`.
+    """
+    up = find_up(np.stack([frame.cam_from_world for frame in scene.frames]))
+    antialiased = prepared.antialiased
+
+    def encode(comments: tuple[str, ...]) -> bytes:
+        return splat_files.encode(
+            kind, prepared.cloud, antialiased=antialiased, comments=comments, up=up
+        )
+
+    read = splat_files.decode(kind, encode(()))
+    in_training = read.transformed(run.training_from_local(prepared.offset))
+    loss = measure_loss(run, scene, period, in_training, _frames(scene, "test", period))
+    comments = _comments(run, scene, period, prepared, loss)
+    return Export(encode(comments), loss, comments)
+
+
+def local_offset(scene: Scene) -> NDArray[np.float64]:
+    """Return what is subtracted from coordinates that are too large for files, else 0. [3]
+
+    It is the same for all periods: the median camera centre, in whole units.
+    """
+    centres = camera_centre(np.stack([frame.cam_from_world for frame in scene.frames]))
+    median = np.round(np.median(centres, axis=0))
+    return median if np.abs(median).max() > FAR_AWAY else np.zeros(3)
 
 
 def measure_loss(
-    run: TrainedRun, scene: Scene, period: float, gaussians: GaussianCloud
+    run: TrainedRun, scene: Scene, period: float, gaussians: GaussianCloud, frames: Sequence[Frame]
 ) -> ExportLoss | None:
-    """Compare exported Gaussians with the model on the photos of the test views of the period.
+    """Compare Gaussians with the model on photos of the period.
 
     Args:
         run: The run that was exported.
         scene: The scene that it was trained on.
         period: Period of the Gaussians.
-        gaussians: In the world frame.
+        gaussians: In the training frame.
+        frames: Views with the photos.
 
     Returns:
-        None where no test photo shows the period.
+        None where no photo shows anything.
     """
     store = ImageStore(scene, max_width=run.record.max_width)
-    back, model = gaussians.transformed(run.training_from_world), run.model(period)
-    frames = scene.select(split="test", period=int(period)) if period == int(period) else ()
-    values = []
+    model, filtered, values = run.model(period), _is_filtered(run), []
     for frame, view in zip(frames, run.frame_views(scene, frames), strict=True):
         photo, mask = store.load(frame), store.load_mask(frame)
         if mask is None or mask.any():
-            own = model.render(view, run.model_period(period))
-            images = own, model.render_gaussians(back, view)
+            images = [model.render(view, run.model_period(period))]
+            images.append(model.render_gaussians(gaussians, view))
+            if filtered:
+                images.append(model.render_gaussians(gaussians, view, plain=True))
             values.append([psnr(to_bytes(image.rgb), photo, mask) for image in images])
     if not values:
         return None
-    return ExportLoss(len(values), *np.mean(values, axis=0).tolist())
+    own, *exported = np.mean(values, axis=0).tolist()
+    return ExportLoss(len(values), own, exported[-1], exported[0] if filtered else None)
+
+
+def _frames(scene: Scene, split: str, period: float) -> tuple[Frame, ...]:
+    """Return the frames of a period; none in between periods."""
+    return tuple(scene.select(split=split, period=int(period))) if period == int(period) else ()
+
+
+def _adapted(
+    run: TrainedRun, scene: Scene, period: float, filtered: Prepared, viewers: str | None
+) -> Prepared:
+    """Return Gaussians for viewers without the filter; those with it if these lose too much."""
+    training_from_local = run.training_from_local(filtered.offset)
+    before, model = filtered.cloud.transformed(training_from_local), run.model(period)
+    frames = _frames(scene, "train", period)
+    # Views of all periods serve in between periods.
+    known = frames or [f for f in scene.select(split="train") if f.period < run.num_periods]
+    after = model.adapt_to_plain(before, run.frame_views(scene, known))
+    plain = Prepared(after.transformed(training_from_local.inverse()), filtered.offset, False)
+    if viewers == "plain":
+        return plain
+    with_filter = measure_loss(run, scene, period, before, frames)
+    without = measure_loss(run, scene, period, after, frames)
+    if with_filter is None or without is None or with_filter.filtered is None:
+        return plain
+    return plain if with_filter.filtered - without.plain < LIMIT_DB else filtered
+
+
+def _is_filtered(run: TrainedRun) -> bool:
+    return bool(getattr(run.config, "antialiased", False))
+
+
+def _comments(
+    run: TrainedRun, scene: Scene, period: float, prepared: Prepared, loss: ExportLoss | None
+) -> tuple[str, ...]:
+    """Return what a file says of itself, in ASCII as PLY has it."""
+    label = run.record.period_labels.get(f"{period:g}", "")
+    of_period = f"period {period:g} {label if label != f'{period:g}' else ''}".strip()
+    kind = "with" if prepared.antialiased else "without"
+    lines = [
+        f"ChronoScene {__version__}: {run.record.method}, scene {scene.name}, {of_period}",
+        f"For viewers {kind} the antialiasing filter of Mip-Splatting",
+        _describe_loss(loss, prepared.antialiased),
+    ]
+    if getattr(run.config, "exposure", "none") != "none":
+        lines.append("The exposure is in the colours; a viewer lacks it where background shows")
+    if prepared.offset.any():
+        lines.append(_describe_offset(scene, prepared.offset))
+    return tuple(line.encode("ascii", "replace").decode() for line in lines)
+
+
+def _describe_loss(loss: ExportLoss | None, antialiased: bool) -> str:
+    if loss is None:
+        return "PSNR lost: not measured, as no test photo shows this period"
+    text = f"PSNR on {counted(loss.views, 'test view')}: model {loss.model:.2f} dB, file "
+    if loss.filtered is None:
+        return f"{text}{loss.plain:.2f} dB: {_lost(loss.model, loss.plain)} dB lost"
+    text += f"{loss.plain:.2f} dB without the filter, {loss.filtered:.2f} dB with it: "
+    if antialiased:
+        return f"{text}{_lost(loss.model, loss.filtered)} dB lost with it"
+    return f"{text}{_lost(loss.model, loss.plain)} dB lost without it"
+
+
+def _lost(model: float, file: float) -> str:
+    return f"{round(model - file, 2) + 0.0:.2f}"  # never -0.00
+
+
+def _describe_offset(scene: Scene, offset: NDArray[np.float64]) -> str:
+    text = "Add {:.0f} {:.0f} {:.0f} to coordinates of this file for those".format(*offset)
+    if scene.world.crs is None:
+        return f"{text} of the scene"
+    total = offset + np.asarray(scene.world.offset)
+    return text + " of the scene, {} {} {} for {}".format(*total, scene.world.crs)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
@@ -234,7 +234,9 @@ class TrainedRun:
                 todo="leave it out, or open a run of chronogs under strategy joint",
             )
 
-    def gaussians(self, period: float, *, scene: Scene | None = None) -> GaussianCloud:
+    def gaussians(
+        self, period: float, *, scene: Scene | None = None, offset: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> GaussianCloud:
         """Return the model of a period as Gaussians in the world frame of the scene.
 
         What changes with the direction of view (such as the opacities of ChronoGS) is fitted to the
@@ -243,6 +245,8 @@ class TrainedRun:
         Args:
             period: As for `render`.
             scene: The scene of the run, if it has been read already.
+            offset: Subtracted from the positions before they are rounded to float32, which holds
+                coordinates in the millions to half a unit only. [3]
 
         Returns:
             float32 arrays; positions and sizes in world units.
@@ -266,7 +270,11 @@ class TrainedRun:
         frames = scene.select(split="train", period=own)
         views = self.frame_views(scene, (f for f in frames if f.period < self.num_periods))
         gaussians = model.to_gaussians(self.model_period(period), views)
-        return gaussians.transformed(self.training_from_world.inverse())
+        return gaussians.transformed(self.training_from_local(offset).inverse())
+
+    def training_from_local(self, offset: ArrayLike) -> Sim3:
+        """Return the transform into the training frame from the world minus an offset [3]."""
+        return self.training_from_world @ Sim3(1.0, np.eye(3), np.asarray(offset, np.float64))
 
     def test_views(self) -> Iterator[PredictedView]:
         """Yield the test views with prediction and photo, as bench wrote and scored them.
