@@ -33,7 +33,7 @@ MIN_VIEWS = 2  # Observations that a point needs to have a position
 
 @dataclass(frozen=True, slots=True)
 class Edits:
-    """What is to be left out and renamed. An image stays if all choices allow it."""
+    """Choices of what to leave out and rename. An image stays if all choices allow it."""
 
     keep: tuple[str, ...] = ()
     """Names or patterns of the only images to keep; none to keep all."""
@@ -58,7 +58,7 @@ class Edited:
     """The new scene."""
     images_dropped: int
     images_outside: int
-    """Those among them that see nothing in the box."""
+    """Images among them that see nothing in the box."""
     points_outside: int
     points_unseen: int
     """Points that lost observations and have fewer than `MIN_VIEWS` left."""
@@ -231,7 +231,7 @@ def _inside(points: Points, box: Box) -> NDArray[np.bool_]:
         ConfigError: If there is none.
     """
     low, high = np.array(box[:3]), np.array(box[3:])
-    inside: NDArray[np.bool_] = ((points.xyz >= low) & (points.xyz <= high)).all(axis=1)
+    inside = np.asarray(((points.xyz >= low) & (points.xyz <= high)).all(axis=1))
     if not inside.any():
         finite = points.xyz[np.isfinite(points.xyz).all(axis=1)]
         found = "none"
@@ -305,7 +305,8 @@ def _merged(
     for period in periods:
         label = labels.get(period.id, period.label)
         groups.setdefault(label if label in new_labels else period.id, []).append(period)
-    merged, number = [], {}
+    merged: list[Period] = []
+    number: dict[int, int] = {}
     for i, (key, group) in enumerate(groups.items()):
         first = group[0]
         unnamed = first.label == str(first.id)

@@ -33,7 +33,7 @@ POSED_NEIGHBOURS, POSED_CANDIDATES = 12, 60
 """Neighbours of an image with a known pose in every period, and the nearest they are chosen of."""
 
 LEAST_COSINE = 0.25
-"""Of the angle between the directions of view of neighbours, 75 degrees. SIFT features are lost
+"""Cosine of the angle between the directions of view of neighbours: 75 degrees. SIFT features are lost
 long before."""
 
 WORDS = 64
