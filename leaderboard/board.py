@@ -86,8 +86,8 @@ def read_board(
             if known.claimed and not standing.claimed:
                 found[standing.entry.key] = path, standing
                 first, path = path, first
-            error = refused(path, f"an entry of the same runs as {first}")
-            board.notices.append(f"left out: {error}")
+            twice = refused(path, f"an entry of the same runs as {first}")
+            board.notices.append(f"left out: {twice}")
         board.notices += [f"{path}: no entry is of this scene" for path in truths.idle]
     board.standings = [standing for _, standing in found.values()]
     return board

@@ -63,7 +63,8 @@ def make_group(
     periods = sorted({i for run in runs for i in run.periods}, key=int)
     names = metric_names(runs)
     quality, *others = [name for name in PAPER_METRICS if name in names] or names
-    parts, devices = {}, {}
+    parts: dict[str, DataFrame] = {}
+    devices: dict[str, None] = {}
     for kind, (_, part) in found.items():
         timed = part.quantity == "seconds"
         parts[kind] = part.assign(column=part.column.mask(timed, part.device))
