@@ -69,7 +69,7 @@ class ReferenceSystem:
     """
 
     text: str
-    """As PROJ reads it, such as ``EPSG:32632``."""
+    """Its name for PROJ, such as ``EPSG:32632``."""
     is_projected: bool
 
     def to_local(self, frame: Georeference, xyz: Array) -> Array:

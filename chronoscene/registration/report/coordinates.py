@@ -30,7 +30,7 @@ POINTS = "points.ply"
 CONTROL = "control.csv"
 
 DECIMALS = 4
-"""Of metres: a tenth of a millimetre."""
+"""Decimals of coordinates in metres: a tenth of a millimetre."""
 
 
 def write_coordinates(folder: Path, model: Registered, output: ReferenceSystem | None) -> None:
@@ -148,7 +148,7 @@ def write_control(path: Path, points: Sequence[PointResidual]) -> None:
 
 
 def _metres(values: Iterable[float]) -> list[str]:
-    return [f"{value:.{DECIMALS}f}" for value in values]
+    return [f"{round(value, DECIMALS) + 0.0:.{DECIMALS}f}" for value in values]  # no -0.0000
 
 
 def _write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -1,6 +1,6 @@
 """Clicks as observations: where they place points, and how well each point fits.
 
-A point has two kinds of residuals. The click consistency, in pixels, tells how well its clicks and
+A point has two kinds of residuals. The click consistency, in pixels, measures how well its clicks and
 the poses agree with each other: a model that is kilometres off in the world can have none. The
 error, in metres, is the distance from surveyed coordinates.
 """
@@ -162,7 +162,7 @@ def with_tie_tracks(model: Registered, tie_points: TiePoints) -> Registered:
 
 
 def residuals(model: Registered, clicks: Clicks) -> Iterator[PointResidual]:
-    """How well the clicks of each point agree with each other."""
+    """Measure how well the clicks of each point agree with each other."""
     rays = moved(clicks.rays, model)
     placed = place_clicks(rays)
     by_all = dict(zip(placed.track.tolist(), placed.xyz, strict=True))

@@ -96,7 +96,7 @@ def align_with_tie_points(
     if used and model.georeference is None and tie_points.crs is not None:
         there = replace(there, georeference=frame, gps_enu=np.full_like(model.gps_enu, np.nan))
     if not used and model.georeference is None:
-        known = {}  # nothing tells where the model is
+        known = {}  # the place of the model is unknown
 
     def convert(xyz: Array) -> Array:
         if output is None or there.georeference is None:

@@ -96,7 +96,7 @@ class TiePoints:
         if frame is None:
             return {}
         enu = self.crs.to_local(frame, np.array(list(known.values())))
-        lost = [n for n, good in zip(known, np.isfinite(enu).all(axis=1), strict=True) if not good]
+        lost = [n for n, place in zip(known, enu, strict=True) if not np.isfinite(place).all()]
         if lost:
             raise SceneError(
                 self.path,
@@ -135,7 +135,7 @@ def read_tie_points(
         )
         crs = next((read_reference_system(f"{path}:{n}", text) for n, text in named), crs)
         rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")])
-    scaled = ((p, replace(c, x=scale * c.x, y=scale * c.y), *w) for p, c, *w in rows)
+    scaled = ((p, replace(c, x=scale * c.x, y=scale * c.y), w, r) for p, c, w, r in rows)
     return _assemble(path, scaled, crs)
 
 

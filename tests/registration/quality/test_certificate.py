@@ -18,7 +18,7 @@ from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment, Transfers
 from chronoscene.registration.quality.overlap import tie_spread
-from chronoscene.registration.quality.position import Position
+from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position
 from chronoscene.registration.quality.rays import PlacedPoints, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.quality.verdict import THRESHOLDS, judge
@@ -374,7 +374,7 @@ def test_extent_of_cameras_that_stand_still(good: Registered) -> None:
 
 def test_the_documented_thresholds_are_those_of_the_code() -> None:
     text = (Path(__file__).parents[3] / "docs/reference/certificate.md").read_text(encoding="utf-8")
-    for t in THRESHOLDS.values():
+    for t in (*THRESHOLDS.values(), *POSITION_THRESHOLDS.values()):
         sign = "below" if t.larger_is_better else "above"
         unit = f" {t.unit}" if t.unit else ""
         fail = f"{sign} {t.fail:g}{unit}" if t.fail is not None else "-"
