@@ -1,7 +1,7 @@
 """Clicks as observations: where they place points, and how well each point fits.
 
-A point has two kinds of residuals. The click consistency, in pixels, measures how well its clicks and
-the poses agree with each other: a model that is kilometres off in the world can have none. The
+A point has two kinds of residuals. The click consistency, in pixels, measures how well clicks and
+poses agree with each other: a model that is kilometres off in the world can have none. The
 error, in metres, is the distance from surveyed coordinates.
 """
 
