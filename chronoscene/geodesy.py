@@ -1,19 +1,27 @@
-"""Geodetic positions in a local east-north-up frame in metres, by PROJ.
+"""Positions in a local east-north-up frame in metres, geodetic and projected, by PROJ.
 
 The frame is topocentric (EPSG method 9837) around a position: there is no map projection and so
 no distortion. No geoid grid is needed, because heights are used as stated: heights above sea level
-instead of the ellipsoid shift the whole frame vertically and do not bend it.
+instead of the ellipsoid shift the whole frame vertically and do not bend it. Projected coordinates
+are no such frame: their scale is not 1, their north is not north, and they ignore the curvature of
+the earth. So they are converted point by point.
 """
 
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 
 from chronoscene.arrays import Array
+from chronoscene.errors import ChronoSceneError, SceneError
+
+STEP = 10.0
+"""Metres to either side over which a projection is differentiated: curvature cancels out."""
 
 HeightKind = Literal["as stated", "relative", "none"]
 
@@ -52,6 +60,77 @@ class Georeference:
         return np.stack([lat, lon, height], axis=-1)
 
 
+@dataclass(frozen=True, slots=True)
+class ReferenceSystem:
+    """A projected or geographic reference system.
+
+    Coordinates are east, north, height, or longitude, latitude, height. Heights are those of
+    `Georeference`, unchanged.
+    """
+
+    text: str
+    """Its name for PROJ, such as ``EPSG:32632``."""
+    is_projected: bool
+
+    def to_local(self, frame: Georeference, xyz: Array) -> Array:
+        """Coordinates in this system to a local frame; not finite outside its area. [N, 3]"""
+        longitude, latitude = _to_wgs84(self.text).transform(xyz[:, 0], xyz[:, 1])
+        return frame.to_enu(latitude, longitude, xyz[:, 2])
+
+    def from_local(self, frame: Georeference, enu: Array) -> Array:
+        """Inverse of `to_local`. [N, 3]"""
+        latitude, longitude, height = frame.to_geodetic(enu).T
+        inverse: Any = "INVERSE"
+        x, y = _to_wgs84(self.text).transform(longitude, latitude, direction=inverse)
+        return np.column_stack([x, y, height])
+
+    def derivative(self, frame: Georeference, enu: Array) -> Array:
+        """Derivative of the coordinates by those of the local frame. [N, 3] -> [N, 3, 3]"""
+        places = enu[:, None, None] + STEP * np.array([1.0, -1.0])[:, None, None] * np.eye(3)
+        ahead, behind = np.moveaxis(
+            self.from_local(frame, places.reshape(-1, 3)).reshape(places.shape), 1, 0
+        )
+        return np.asarray(np.swapaxes(ahead - behind, 1, 2) / (2 * STEP))
+
+
+def read_reference_system(
+    place: str, text: str, *, error: type[ChronoSceneError] = SceneError
+) -> ReferenceSystem:
+    """Parse a reference system.
+
+    Raises:
+        ChronoSceneError: If PROJ does not know it, if it is neither geographic nor projected in
+            metres, if it has heights of its own, or if PROJ lacks the grid that it needs.
+    """
+    import pyproj
+    from pyproj.transformer import TransformerGroup
+
+    def wrong(found: str, todo: str) -> ChronoSceneError:
+        expected = "a horizontal reference system that PROJ knows, such as EPSG:32632"
+        return error(place, expected=expected, found=f"{text[:80]!r}{found}", todo=todo)
+
+    try:
+        crs = pyproj.CRS.from_user_input(text)
+    except pyproj.exceptions.CRSError as cause:
+        raise wrong("", "correct it; WGS84 UTM 32N is understood, too") from cause
+    if crs.is_compound:
+        todo = "give its horizontal part alone: heights stay as they are stated"
+        raise wrong(", which has heights above a geoid", todo)
+    units = {axis.unit_name for axis in crs.axis_info}
+    if not crs.is_geographic and not (crs.is_projected and units == {"metre"}):
+        raise wrong(f", with axes in {', '.join(sorted(units))}", "convert to one in metres")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it warns of what is refused below
+        group = TransformerGroup(crs, "EPSG:4326", always_xy=True)
+    if not group.best_available:
+        grids = (g.short_name for op in group.unavailable_operations[:1] for g in op.grids)
+        raise wrong(
+            f", which PROJ converts exactly only with the grid {', '.join(grids)}",
+            "install it (pyproj sync), or convert to a system on WGS 84",
+        )
+    return ReferenceSystem(text, bool(crs.is_projected))
+
+
 def from_crs(crs: str | None) -> Georeference | None:
     """The frame that `Georeference.crs` describes; None for any other text."""
     number = r"([-+0-9.e]+)"
@@ -78,3 +157,11 @@ def _pipeline(crs: str) -> Any:
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
         f"+step +proj=cart +ellps=WGS84 +step {crs}"
     )
+
+
+@lru_cache(maxsize=16)
+def _to_wgs84(crs: str) -> Any:
+    """Transformer from a reference system to longitude and latitude in degrees."""
+    import pyproj
+
+    return pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from chronoscene.geodesy import Georeference, from_crs, median_longitude
+from chronoscene.errors import SceneError
+from chronoscene.geodesy import Georeference, from_crs, median_longitude, read_reference_system
 
 PLACE = (51.5, 10.25)
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563
@@ -60,3 +61,35 @@ def test_median_longitude_across_the_antimeridian() -> None:
     assert median_longitude(np.array([179.9, -179.9, 179.8])) == pytest.approx(179.9)
     assert median_longitude(np.array([179.9, -179.9, -179.8])) == pytest.approx(-179.9)
     assert median_longitude(np.array([10.0, 12.0, 11.0])) == pytest.approx(11.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("nonsense", "'nonsense'"),
+        ("EPSG:32632+5773", "heights above a geoid"),
+        ("EPSG:4978", "axes in metre"),
+        ("EPSG:2229", "US survey foot"),
+        ("EPSG:27700", "grid"),
+    ],
+)
+def test_systems_that_would_be_converted_wrongly_are_refused(text: str, found: str) -> None:
+    with pytest.raises(SceneError, match=found) as caught:
+        read_reference_system("points.csv:1", text)
+    assert caught.value.place == "points.csv:1"
+
+
+def test_projected_coordinates_and_back() -> None:
+    """Five degrees off the central meridian: north turns by the convergence of the grid."""
+    frame = Georeference(*PLACE, 30.0, "as stated")
+    utm = read_reference_system("", "EPSG:32633")
+    enu = np.array([[0.0, 0.0, 0.0], [800.0, 0.0, 100.0], [-3000.0, 4000.0, -20.0]])
+    projected = utm.from_local(frame, enu)
+    np.testing.assert_allclose(utm.to_local(frame, projected), enu, atol=1e-6)
+    turn = np.arctan(np.tan(np.radians(PLACE[1] - 15)) * np.sin(np.radians(PLACE[0])))
+    axes = utm.derivative(frame, enu)[0]
+    scale = np.hypot(*axes[:2, 0])
+    assert 0.9996 < scale < 1.0010
+    expected = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    np.testing.assert_allclose(axes[:2, :2], expected, atol=2e-5)
+    np.testing.assert_allclose(axes[2], [0, 0, 1], atol=1e-9)

@@ -49,6 +49,9 @@ class Options:
     """File of tie points or ground control."""
     tie_scale: float = 1.0
     """Size of these photos divided by that of the photos that were clicked in."""
+    crs: str | None = None
+    """Projected reference system of coordinates in the output, and of tie points whose file names
+    none; None for that of the tie points."""
     page: bool = False
     """True to write ``registration.html``."""
 

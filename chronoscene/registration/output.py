@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,10 @@ from chronoscene.images.masks import find_masks
 from chronoscene.images.store import Progress
 from chronoscene.io.staging import check_not_current, needing_space, write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
+from chronoscene.registration.quality.position import Position, judge_position
 from chronoscene.registration.quality.verdict import Verdict, judge
 from chronoscene.registration.report.certificate_json import to_json
+from chronoscene.registration.report.coordinates import CONTROL, write_control
 from chronoscene.registration.report.page import render_report
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import with_tie_tracks
@@ -32,7 +34,6 @@ from chronoscene.scene.tracks import reproject, track_owners
 from chronoscene.undistort import undistort
 
 LOG = "registration_log.json"
-GEOREFERENCE = "georeference.json"
 CERTIFICATE = "registration.json"
 PAGE = "registration.html"
 
@@ -129,12 +130,9 @@ def write_scene(scene: Scene, staged: Path, *, progress: Progress | None = None)
     }
 
 
-def write_extras(staged: Path, registered: Registered, log: Mapping[str, Any]) -> None:
-    """Write the log and the georeference."""
+def write_log(staged: Path, log: Mapping[str, Any]) -> None:
+    """Write the log."""
     write_text_atomic(staged / LOG, json.dumps(log, indent=1, ensure_ascii=False) + "\n")
-    if registered.georeference is not None:
-        frame = asdict(registered.georeference) | {"crs": registered.georeference.crs}
-        write_text_atomic(staged / GEOREFERENCE, json.dumps(frame, indent=1) + "\n")
 
 
 def publish(staged: Path, out: Path) -> None:
@@ -168,16 +166,28 @@ def _copy(source: Path, near: Path, out: Path) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inspection:
-    """Certificate and verdict of a registration."""
+    """Certificate of a registration, and the two verdicts on it."""
 
     certificate: Certificate
     verdict: Verdict
+    """On the alignment of the periods with each other."""
+    position: Position
+    """On the absolute position."""
+
+    @property
+    def failed(self) -> bool:
+        """True if one of the verdicts is fail."""
+        return "fail" in (self.verdict.level, self.position.level)
 
     @property
     def summary(self) -> str:
-        """The verdict and what to do, for the end of the command."""
-        lines = [f"verdict: {self.verdict.level}. {self.verdict.text}"]
-        lines += [f"  to do: {todo}" for todo in self.verdict.todo[:3]]
+        """Both verdicts and what to do, for the end of the command."""
+        verdict, position = self.verdict, self.position
+        lines = [f"alignment of the periods: {verdict.level}. {verdict.text}"]
+        lines += [f"  to do: {todo}" for todo in verdict.todo[:3]]
+        lines.append(f"absolute position: {position.level}. {position.text}")
+        lines += [f"  {name}: {rmse.text}" for name, rmse in position.lines]
+        lines += [f"  to do: {todo}" for todo in position.todo[:3]]
         return "\n".join(lines) + "\n"
 
 
@@ -190,7 +200,7 @@ def inspect_registration(
     tie_points: TiePoints | None = None,
     title: str | None = None,
 ) -> Inspection:
-    """Write ``registration.json`` and, if asked for, ``registration.html`` into a folder.
+    """Write ``registration.json``, errors of surveyed points, and a page if asked for.
 
     Args:
         model: The registration, after alignment by tie points.
@@ -202,11 +212,13 @@ def inspect_registration(
     """
     model = model if tie_points is None else with_tie_tracks(model, tie_points)
     certificate = certify(model)
-    verdict = judge(certificate)
-    data = to_json(certificate, verdict, ties)
+    verdict, position = judge(certificate), judge_position(model, ties)
+    data = to_json(certificate, verdict, position, ties)
     write_text_atomic(folder / CERTIFICATE, json.dumps(data, indent=1, allow_nan=False) + "\n")
+    if ties is not None and any(r.role != "tie" for r in ties.residuals):
+        write_control(folder / CONTROL, ties.residuals)
     if page:
         title = title or f"Registration of {folder.resolve().name}"
-        text = render_report(model, certificate, verdict, ties=ties, title=title)
+        text = render_report(model, certificate, verdict, position, ties=ties, title=title)
         write_text_atomic(folder / PAGE, text)
-    return Inspection(certificate, verdict)
+    return Inspection(certificate, verdict, position)

@@ -8,6 +8,7 @@ from typing import Any
 
 from chronoscene.colmap.model import copy_poses
 from chronoscene.errors import ConfigError
+from chronoscene.geodesy import ReferenceSystem, read_reference_system
 from chronoscene.io.processes import Report
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
@@ -17,6 +18,7 @@ from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import PhotoInputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.extension import add_period
+from chronoscene.registration.report.coordinates import write_coordinates
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
 from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
@@ -45,13 +47,14 @@ def run(
         options: Settings; None for the defaults.
         into: Scene to which the captures are added as one new period; its poses do not change.
         report: Called with the progress.
-        inspected: Called with the certificate and the verdict.
+        inspected: Called with the certificate and the verdicts.
 
     Raises:
         RegistrationError: If there is no model, or none of the photos can be placed; what was
             computed is kept in the work folder.
         SceneError: If ``out`` is in use, tie points do not suffice, or ``into`` has distortion.
-        ConfigError: If tie points are given together with ``into``.
+        ConfigError: If tie points are given together with ``into``, or the reference system is
+            unsuitable.
     """
     options = options or Options()
     out = Path(out)
@@ -64,14 +67,17 @@ def run(
         )
     output.check_free(out, overwrite=options.overwrite)
     work = options.work_folder(out)
+    crs = _output_system(options.crs)
     points = None
     if options.tie_points is not None:
-        points = read_tie_points(options.tie_points, scale=options.tie_scale)
+        points = read_tie_points(options.tie_points, scale=options.tie_scale, crs=crs)
+        if crs is None and points.crs is not None and points.crs.is_projected:
+            crs = points.crs
     with work_folder(work) as lock:
         context = Context(work, Stages(work), options, report, lock)
         inputs = gather(captures, into, context)
         matched = find_matches(inputs, context)
-        registered, ties = _tie(estimate(inputs, matched, context), points, inputs, context)
+        registered, ties = _tie(estimate(inputs, matched, context), points, crs, inputs, context)
         staged = _stage_scene(registered, inputs, out.resolve().name, context)
         if ties is not None and ties.replaced:
             points = None  # they are points of the model already
@@ -83,8 +89,10 @@ def run(
             tie_points=points,
             title=f"Registration of {out.resolve().name}",
         )
-        context.stages.remark("verdict", f"{found.verdict.level}: {found.verdict.text}")
-        output.write_extras(staged, registered, _log(registered, inputs, context))
+        for name, judged in (("alignment", found.verdict), ("absolute position", found.position)):
+            context.stages.remark(name, f"{judged.level}: {judged.text}")
+        write_coordinates(staged, registered, crs)
+        output.write_log(staged, _log(registered, inputs, context))
         output.check_free(out, overwrite=options.overwrite)
         output.publish(staged, out)
     if inspected is not None:
@@ -92,8 +100,27 @@ def run(
     return registered
 
 
+def _output_system(text: str | None) -> ReferenceSystem | None:
+    """Parse the reference system of the output; it must be projected."""
+    if text is None:
+        return None
+    crs = read_reference_system("--crs", text, error=ConfigError)
+    if not crs.is_projected:
+        raise ConfigError(
+            "--crs",
+            expected="a projected reference system in metres, such as EPSG:32632",
+            found=f"{text!r}, which is in degrees",
+            todo="choose the UTM zone of the place, for example",
+        )
+    return crs
+
+
 def _tie(
-    registered: Registered, points: TiePoints | None, inputs: PhotoInputs, context: Context
+    registered: Registered,
+    points: TiePoints | None,
+    crs: ReferenceSystem | None,
+    inputs: PhotoInputs,
+    context: Context,
 ) -> tuple[Registered, TieAlignment | None]:
     """Check and align with tie points, if there are any."""
     if points is None:
@@ -102,7 +129,7 @@ def _tie(
     def refine(arguments: Mapping[str, Any]) -> Registered:
         return refined(registered, arguments, inputs, context)
 
-    result = tie(registered, points, refine)
+    result = tie(registered, points, refine, crs)
     context.stages.remark("tie points", *result.remarks)
     return result.model, result
 

@@ -21,7 +21,7 @@ from chronoscene.registration.result import ROUTES, Registered
 
 DEFAULTS = Options()
 
-FAILED = 1  # Exit status if the verdict is fail
+FAILED = 1  # Exit status if a verdict is fail
 
 
 @click.command("register")
@@ -96,8 +96,14 @@ FAILED = 1  # Exit status if the verdict is fail
 @click.option(
     "--tie-points",
     type=EXISTING_FILE,
-    help="CSV of point, image, x, y and optional world coordinates, or ODM's gcp_list.txt: points "
-    "that check the alignment, and replace one that failed.",
+    help="CSV of point, image, x, y and optional world coordinates X, Y, Z and role (control or "
+    "check), or ODM's gcp_list.txt: points that check the alignment, replace one that failed, and "
+    "place the model in the world.",
+)
+@click.option(
+    "--crs",
+    help="Projected reference system of the coordinates that are written, such as EPSG:32632; also "
+    "of tie points whose file names none.  [default: that of the tie points]",
 )
 @click.option(
     "--tie-scale",
@@ -127,8 +133,9 @@ def command(
     Masks lie in masks/ beside the folder of photos: masks/2016/x.jpg.png for 2016/x.jpg, 0 where
     the photo does not count. The same command continues a run that was stopped.
 
-    Exit status: 0 if the verdict is pass or doubtful, 1 if it is fail (the scene is written
-    nevertheless), 2 if the photos cannot be registered or the usage is wrong.
+    There are two verdicts: on the alignment of the periods with each other, and on the absolute
+    position. Exit status: 0 if both are pass, doubtful or not checked, 1 if either is fail (the
+    scene is written nevertheless), 2 if the photos cannot be registered or the usage is wrong.
     """
     folder, table = find_captures(captures, table)
     options = Options(**settings)
@@ -138,8 +145,9 @@ def command(
     inspections: list[Inspection] = []
     try:
         with progress_bar(f"read {captures}") as report:
+            found = read_captures(folder, table=table)
             registered = run(
-                read_captures(folder, table=table),
+                found,
                 out,
                 options,
                 into=None if scene is None else read_scene(scene),
@@ -150,12 +158,13 @@ def command(
         for note in getattr(error, "__notes__", ()):
             say(f"note: {note}")
         raise
-    emit(summary(registered, out) + "".join(i.summary for i in inspections), None)
-    if any(i.verdict.level == "fail" for i in inspections):
+    text = summary(registered, out, options.crs) + "".join(i.summary for i in inspections)
+    emit(text + "".join(f"note: {note}\n" for note in found.misdated), None)
+    if any(i.failed for i in inspections):
         context.exit(FAILED)
 
 
-def summary(registered: Registered, out: Path) -> str:
+def summary(registered: Registered, out: Path, crs: str | None) -> str:
     """The result in a few lines."""
     lines = [f"{out}: route {registered.route}, unit {registered.unit}"]
     for i, label in enumerate(registered.labels):
@@ -169,4 +178,6 @@ def summary(registered: Registered, out: Path) -> str:
             f"  ... and {len(registered.unregistered) - 10} more; see registration_log.json"
         )
     lines.append(f"{len(registered.points)} points; decisions in {out / 'registration_log.json'}")
+    if crs is not None and registered.georeference is None:
+        lines.append(f"no coordinates in {crs}: neither GPS nor ground control places the model")
     return "\n".join(lines) + "\n"

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import date, datetime, timedelta
 from pathlib import Path, PurePosixPath
 
 from chronoscene.errors import SceneError
@@ -44,6 +44,8 @@ class Captures:
     refused: tuple[tuple[str, int, str], ...]
     """Path below the root, period, and reason of each photo that cannot be used."""
     remarks: tuple[str, ...]
+    misdated: tuple[str, ...] = ()
+    """Periods with photos that were taken at another time by their metadata, in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +77,11 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
         SceneError: If there are no photos, or the table is wrong.
     """
     path, table = find_captures(Path(path), table)
-    remarks: list[str] = []
     if table is not None:
-        listed = _from_table(path, table)
-    elif groups := _period_folders(path):
-        listed = groups
-    else:
-        listed, remarks = _by_date(path, _photos_in(path))
-    return _assemble(path, listed, remarks)
+        return _assemble(path, _from_table(path, table))
+    if groups := _period_folders(path):
+        return _assemble(path, groups)
+    return _assemble(path, *_by_date(path, _photos_in(path)))
 
 
 def _photos_in(folder: Path) -> list[Path]:
@@ -161,7 +160,17 @@ def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str]]:
     return listed, [f"periods proposed from the dates of the photos: {labels}"]
 
 
-def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Captures:
+def _assemble(
+    root: Path, listed: Sequence[_Listed], proposed: Sequence[str] | None = None
+) -> Captures:
+    """Open all photos.
+
+    Args:
+        root: Folder of the captures.
+        listed: Files with the labels of their periods.
+        proposed: Remarks on periods that were proposed from dates; None for given periods, whose
+            photos may contradict them.
+    """
     if not listed:
         raise _nothing(root, "no image files")
     order = _ordered_labels(listed)
@@ -178,14 +187,80 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
     if not images:
         raise _nothing(root, f"{len(refused)} files, none usable ({refused[0][2]})")
     images.sort(key=lambda c: c.name)
+    dated = [
+        [(c.name, c.taken.date()) for c in images if c.period == i and c.taken is not None]
+        for i in range(len(order))
+    ]
+    none: list[_Dated] = [[] for _ in order]
+    wrong = _contradictions(order, dated) if proposed is None else none
     periods = tuple(
-        CapturePeriod(label, _period_date(label, [c for c in images if c.period == i]))
-        for i, label in enumerate(order)
+        CapturePeriod(label, _period_date(label, {day for _, day in set(mine) - set(others)}))
+        for label, mine, others in zip(order, dated, wrong, strict=True)
     )
     _check_names(root, images)
     shown = ", ".join(f"{i} = {p.label} ({p.date or 'no date'})" for i, p in enumerate(periods))
-    remarks = [*remarks, f"periods: {shown}"]
-    return Captures(root, tuple(images), periods, tuple(refused), tuple(remarks))
+    misdated = tuple(
+        f"period {label}: {len(others)} of {len(mine)} photos have another date (EXIF, or file "
+        f"name), such as {others[0][0]}: {others[0][1]}; move them to their period, or ignore this "
+        "if the clock of the camera was wrong"
+        for label, mine, others in zip(order, dated, wrong, strict=True)
+        if others
+    )
+    remarks = (*(proposed or ()), f"periods: {shown}", *misdated)
+    return Captures(root, tuple(images), periods, tuple(refused), remarks, misdated)
+
+
+_Dated = list[tuple[str, date]]  # Names of photos, and when they were taken
+
+
+def _contradictions(labels: Sequence[str], dated: Sequence[_Dated]) -> list[_Dated]:
+    """Find the photos of each period whose dates contradict it.
+
+    A photo does so if it was taken more than `PERIOD_GAP_DAYS` from its period and within another
+    one. Where the label of its period is a date, either is enough.
+    """
+    named = [_named_span(label) for label in labels]
+    spans = [n or _usual_span([d for _, d in mine]) for n, mine in zip(named, dated, strict=True)]
+
+    def contradicts(day: date, period: int) -> bool:
+        away = _days_from(day, spans[period])
+        elsewhere = any(s is not None and _days_from(day, s) == 0 for s in spans)
+        if named[period] is None:
+            return away > PERIOD_GAP_DAYS and elsewhere
+        return away > PERIOD_GAP_DAYS or (away > 0 and elsewhere)
+
+    return [[photo for photo in mine if contradicts(photo[1], i)] for i, mine in enumerate(dated)]
+
+
+def _named_span(label: str) -> tuple[date, date] | None:
+    """First and last day of the year, month or day that a label begins with."""
+    found = re.match(r"((?:19|20)\d\d)(?:[-_.]?(\d\d))?(?:[-_.]?(\d\d))?(?=$|[-_. ])", label)
+    if found is None:
+        return None
+    year, month, day = (int(part) if part else None for part in found.groups())
+    assert year is not None
+    try:
+        first = date(year, month or 1, day or 1)
+    except ValueError:
+        return None
+    if day:
+        return first, first
+    after = date(year + (month or 12) // 12, (month or 12) % 12 + 1, 1)
+    return first, after - timedelta(days=1)
+
+
+def _usual_span(days: Sequence[date]) -> tuple[date, date] | None:
+    """First and last day without the first and the last quarter; None if there are no days."""
+    ordered = sorted(days)
+    cut = len(ordered) // 4
+    return (ordered[cut], ordered[-1 - cut]) if ordered else None
+
+
+def _days_from(day: date, span: tuple[date, date] | None) -> int:
+    """Days between a day and a span; 0 inside, or if there is none."""
+    if span is None:
+        return 0
+    return max(0, (span[0] - day).days, (day - span[1]).days)
 
 
 def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
@@ -203,9 +278,9 @@ def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
     return sorted(by_label, key=natural_key)
 
 
-def _period_date(label: str, captures: Sequence[Capture]) -> str | None:
+def _period_date(label: str, dates: Iterable[date]) -> str | None:
     """Find the day, month or year that all photos of a period share."""
-    days = sorted({c.taken.date() for c in captures if c.taken is not None})
+    days = sorted(dates)
     if not days:
         return label if is_iso_date(label) else None
     first, last = days[0], days[-1]

@@ -177,7 +177,7 @@ class Objection:
 
     level: Level
     check: str
-    """Key in `THRESHOLDS`, ``link`` or ``chain``."""
+    """Key of the threshold, or name of another test."""
     place: str
     """Period or pair of periods, in words."""
     found: str
@@ -212,25 +212,31 @@ def judge(certificate: Certificate) -> Verdict:
         mine = list(_of_pair(certificate, pair))
         measured = isinstance(pair.by_all, Misalignment) or not isinstance(pair.held_out, str)
         linked = measured or pair.ties.points >= MIN_TIES
-        pairs[pair.a, pair.b] = _worst(f.level for f in mine) if linked else None
+        pairs[pair.a, pair.b] = worst_level(f.level for f in mine) if linked else None
         objections += mine if linked else []
     good = _bounds(certificate, [k for k, level in pairs.items() if level == "pass"])
     if all(good[k] <= 1 or level == "pass" for k, level in pairs.items()):
         # Chains of good pairs that link all periods supply what single pairs lack.
         objections = [o for o in objections if o.level == "fail" or o.check not in LACKING]
     objections += _links(certificate, pairs, good)
-    level = _worst(f.level for f in objections)
+    level = worst_level(f.level for f in objections)
     objections.sort(key=lambda f: -LEVELS.index(f.level))
     return Verdict(level, _words(certificate, level, objections), tuple(objections), pairs)
 
 
-def _worst(levels: Iterator[Level]) -> Level:
+def worst_level(levels: Iterator[Level]) -> Level:
+    """The most severe of some levels; pass if there are none."""
     return max(levels, key=LEVELS.index, default="pass")
 
 
 def _check(key: str, value: float, place: str, note: str = "") -> Iterator[Objection]:
+    yield from check(THRESHOLDS[key], value, place, key, note)
+
+
+def check(
+    threshold: Threshold, value: float, place: str, key: str, note: str = ""
+) -> Iterator[Objection]:
     """An objection, unless the figure passes."""
-    threshold = THRESHOLDS[key]
     level = threshold.level(value)
     if level == "pass":
         return

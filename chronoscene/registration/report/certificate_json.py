@@ -22,11 +22,12 @@ from chronoscene.registration.quality.certificate import (
 from chronoscene.registration.quality.gps_fit import PeriodGpsFit
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Interval, Misalignment, rotation_angle
+from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position, Rmse
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
 from chronoscene.registration.quality.verdict import THRESHOLDS, Verdict
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 
-FORMAT = "chronoscene-registration-1"
+FORMAT = "chronoscene-registration-2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,17 +167,21 @@ def _interval(name: str, size: Interval, unit: str, over: str, *, factor: float 
 
 
 def to_json(
-    certificate: Certificate, verdict: Verdict, ties: TieAlignment | None = None
+    certificate: Certificate, verdict: Verdict, position: Position, ties: TieAlignment | None = None
 ) -> dict[str, Any]:
     """Content of ``registration.json``: plain data, finite numbers or null."""
     return _plain(
         {
             "format": FORMAT,
             "chronoscene": __version__,
-            "verdict": verdict.level,
-            "text": verdict.text,
-            "todo": list(verdict.todo),
-            "findings": [asdict(f) for f in verdict.objections],
+            "alignment": _judgement(verdict),
+            "absolute_position": _judgement(position)
+            | {
+                "check_points": _rmse(position.check),
+                "control_points": _rmse(position.control),
+                "cameras_against_gps": _rmse(position.gps),
+                "ground_pixel": position.ground_pixel,
+            },
             "route": certificate.route,
             "unit": certificate.unit,
             "extent": certificate.extent,
@@ -211,8 +216,24 @@ def to_json(
                 "points": [asdict(r) for r in ties.residuals],
             },
             "thresholds": [{"key": key} | asdict(t) for key, t in THRESHOLDS.items()],
+            "position_thresholds": [
+                {"key": key} | asdict(t) for key, t in POSITION_THRESHOLDS.items()
+            ],
         }
     )
+
+
+def _judgement(found: Verdict | Position) -> dict[str, Any]:
+    return {
+        "verdict": found.level,
+        "text": found.text,
+        "todo": found.todo,
+        "findings": [asdict(f) for f in found.objections],
+    }
+
+
+def _rmse(found: Rmse | None) -> dict[str, Any] | None:
+    return None if found is None else asdict(found)
 
 
 def _similarity(pair: PairFigures) -> dict[str, Any] | None:

@@ -12,6 +12,7 @@ from chronoscene import __version__
 from chronoscene.arrays import Array
 from chronoscene.io.pages import render_page
 from chronoscene.registration.quality.certificate import Certificate, PairFigures
+from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position
 from chronoscene.registration.quality.verdict import THRESHOLDS, Level, Verdict
 from chronoscene.registration.report.certificate_json import pair_figures, period_figures
 from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos, camera_map
@@ -23,6 +24,14 @@ FLICKERS = 8  # Comparisons on the page, for all pairs of periods together
 CLICKS = 6  # Spots suggested for clicking, for each pair of periods
 MAX_LINES = 120  # Matches that are drawn between two photos
 
+LEVEL_WORDS = {
+    "pass": "Pass",
+    "doubtful": "Doubtful",
+    "fail": "Fail",
+    "not checked": "Not checked",
+    None: "Not linked",
+}
+
 COLORS = (
     "#2f7ed8", "#d9622b", "#2a9d5c", "#a44bd1", "#b8860b", "#0f9aa7", "#d1477f", "#6b7280",
 )  # fmt: skip
@@ -33,6 +42,7 @@ def render_report(
     model: Registered,
     certificate: Certificate,
     verdict: Verdict,
+    position: Position,
     *,
     ties: TieAlignment | None = None,
     title: str = "Registration",
@@ -43,6 +53,7 @@ def render_report(
         model: The registration; its photos are read from ``images_root`` where they exist.
         certificate: Of this model.
         verdict: On this certificate.
+        position: On the absolute position.
         ties: Result of clicked tie points, if there were any.
         title: Of the page.
     """
@@ -53,7 +64,8 @@ def render_report(
         version=__version__,
         certificate=certificate,
         verdict=verdict,
-        levels={"pass": "Pass", "doubtful": "Doubtful", "fail": "Fail", None: "Not linked"},
+        position=position,
+        levels=LEVEL_WORDS,
         colors=[COLORS[i % len(COLORS)] for i in range(len(certificate.labels))],
         map=camera_map(model) if model.names else None,
         periods=[(p, list(period_figures(p))) for p in certificate.periods],
@@ -66,7 +78,7 @@ def render_report(
         flickers=_flickers(model, certificate, photos),
         clicks=_clicks(model, certificate, verdict),
         ties=ties,
-        thresholds=list(THRESHOLDS.values()),
+        thresholds=[*THRESHOLDS.values(), *POSITION_THRESHOLDS.values()],
         unregistered=sorted(model.unregistered.items()),
     )
 

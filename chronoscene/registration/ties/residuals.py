@@ -1,8 +1,13 @@
-"""Clicks as observations: where they place tie points, and how well each point fits."""
+"""Clicks as observations: where they place points, and how well each point fits.
+
+A point has two kinds of residuals. The click consistency, in pixels, measures how well clicks and
+poses agree with each other: a model that is kilometres off in the world can have none. The
+error, in metres, is the distance from surveyed coordinates.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,27 +16,43 @@ from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, place, project, rays_at
 from chronoscene.registration.result import Registered
-from chronoscene.registration.ties.tie_points import TiePoints, match_images
+from chronoscene.registration.ties.tie_points import Role, TiePoints, match_images
 
 OUTLIER_PIXELS = 12.0
 """A click with a smaller error is no outlier: people click to within a few pixels."""
 
 
+Place = tuple[float, float, float]
+
+
 @dataclass(frozen=True, slots=True)
 class PointResidual:
-    """Residuals of one tie point."""
+    """Residuals of one point."""
 
     name: str
     clicks: int
     periods: tuple[str, ...]
     """Labels of the periods whose images it is clicked in."""
-    pixels: float | None
-    """Root mean square over its clicks; None where it is clicked in one image only."""
-    distance: float | None
-    """World units: largest distance between its places by single periods, or to its control."""
+    click_consistency: float | None
+    """Pixels: root mean square distance of its clicks from the projections of the place that they
+    determine together. None where they determine none."""
+    between_periods: float | None
+    """World units: largest distance between its places by single periods."""
+    ground_pixel: float | None
+    """World units that a pixel covers at the point."""
+    place: Place | None
+    """World coordinates, by all of its clicks."""
     outlier: bool
+    """True if clicks contradict each other."""
     note: str
     """Problem of the point, or ``""``."""
+    role: Role = "tie"
+    used: bool = False
+    """True for control that the model was moved to."""
+    surveyed: Place | None = None
+    """Coordinates that it should have: of the output reference system, else of the model."""
+    error: Place | None = None
+    """Metres east, north and up: its place minus what was surveyed, likewise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +64,11 @@ class Clicks:
     rays: TrackRays
     """A track is an index into ``names``."""
     xy: Array
+
+    def without(self, names: set[str]) -> Clicks:
+        """Clicks of other points; points keep their numbers."""
+        kept = ~np.isin(self.rays.track, [i for i, n in enumerate(self.names) if n in names])
+        return replace(self, rays=self.rays.where(kept), xy=self.xy[kept])
 
 
 def clicks_of(model: Registered, tie_points: TiePoints) -> tuple[Clicks, list[str]]:
@@ -111,12 +137,11 @@ def misfit(model: Registered, clicks: Clicks) -> float:
 def with_tie_tracks(model: Registered, tie_points: TiePoints) -> Registered:
     """Add the tie points to the points of a model, so that bundle adjustment uses them.
 
-    Points that cannot be placed, and outliers, are left out.
+    Points that cannot be placed, outliers and check points are left out.
     """
-    clicks, _ = clicks_of(model, tie_points)
-    rays = moved(clicks.rays, model)
-    placed = place_clicks(rays)
-    bad = {r.name for r in residuals(model, clicks, {}) if r.outlier}
+    clicks = clicks_of(model, tie_points)[0].without(tie_points.names("check"))
+    placed = place_clicks(clicks.rays)
+    bad = {r.name for r in residuals(model, clicks) if r.outlier}
     rows, points = [], []
     for track, xyz in zip(placed.track, placed.xyz, strict=True):
         if clicks.names[track] not in bad:
@@ -136,9 +161,8 @@ def with_tie_tracks(model: Registered, tie_points: TiePoints) -> Registered:
     )
 
 
-def residuals(
-    model: Registered, clicks: Clicks, control: dict[str, Array]
-) -> Iterator[PointResidual]:
+def residuals(model: Registered, clicks: Clicks) -> Iterator[PointResidual]:
+    """Measure how well the clicks of each point agree with each other."""
     rays = moved(clicks.rays, model)
     placed = place_clicks(rays)
     by_all = dict(zip(placed.track.tolist(), placed.xyz, strict=True))
@@ -148,45 +172,78 @@ def residuals(
     for track, name in enumerate(clicks.names):
         mine = rays.where(rays.track == track)
         labels = tuple(model.labels[p] for p in np.unique(model.periods[mine.image]))
-        places = [p.xyz[p.track == track] for p in own]
-        alone = np.concatenate(places)
-        xyz = by_all.get(track, control.get(name, alone.mean(axis=0) if len(alone) else None))
-        if xyz is None or not len(mine):
-            disagree = len(mine) > 2
-            note = "not registered"
-            if len(mine):
-                note = (
-                    "its clicks do not meet in one point"
-                    if disagree
-                    else "clicked in only one image, or without parallax"
-                )
-            yield PointResidual(
-                name, len(mine), labels, pixels=None, distance=None, outlier=disagree, note=note
-            )
-            continue
-        residual = project(mine, np.tile(xyz, (len(mine), 1)))[0]
-        error = np.nan_to_num(np.linalg.norm(residual, axis=1), nan=np.inf)
-        gaps = np.linalg.norm(alone - control[name], axis=1) if name in control else None
-        if gaps is None and len(alone) > 1:
-            gaps = np.linalg.norm(alone[:, None] - alone[None], axis=2).ravel()
-        yield _of_point(model, name, mine, labels, error, gaps)
+        alone = np.concatenate([p.xyz[p.track == track] for p in own])
+        xyz = by_all.get(track, alone.mean(axis=0) if len(alone) else None)
+        if xyz is None:
+            yield _unplaced(name, len(mine), labels)
+        else:
+            gaps = np.linalg.norm(alone[:, None] - alone[None], axis=2)
+            yield _of_point(model, name, mine, labels, xyz, gaps)
+
+
+def _unplaced(name: str, clicks: int, labels: tuple[str, ...]) -> PointResidual:
+    disagree = clicks > 2
+    note = "clicked in only one image, or without parallax"
+    if not clicks:
+        note = "not registered"
+    elif disagree:
+        note = "its clicks do not meet in one point"
+    return PointResidual(
+        name, clicks, labels, click_consistency=None, between_periods=None, ground_pixel=None,
+        place=None, outlier=disagree, note=note,
+    )  # fmt: skip
 
 
 def _of_point(
-    model: Registered, name: str, rays: TrackRays, labels: tuple[str, ...], error: Array,
-    gaps: Array | None,
+    model: Registered, name: str, rays: TrackRays, labels: tuple[str, ...], xyz: Array,
+    gaps: Array,
 ) -> PointResidual:  # fmt: skip
+    residual, _, depth = project(rays, np.tile(xyz, (len(rays), 1)))
+    error = np.nan_to_num(np.linalg.norm(residual, axis=1), nan=np.inf)
     worst = int(np.argmax(error))
     outlier = bool(error[worst] > OUTLIER_PIXELS)
-    note = ""
-    if outlier:
-        note = f"{error[worst]:.0f} px off in {model.names[rays.image[worst]]}"
+    note = f"{error[worst]:.0f} px off in {model.names[rays.image[worst]]}" if outlier else ""
     return PointResidual(
         name,
         len(rays),
         labels,
-        pixels=float(np.sqrt(np.mean(error**2))),
-        distance=float(gaps.max()) if gaps is not None and len(gaps) else None,
+        click_consistency=float(np.sqrt(np.mean(error**2))),
+        between_periods=float(gaps.max()) if len(gaps) > 1 else None,
+        ground_pixel=float(np.median(np.abs(depth) / rays.focal.mean(axis=1))),
+        place=_place(xyz),
         outlier=outlier,
         note=note,
     )
+
+
+def with_errors(
+    found: Iterator[PointResidual],
+    tie_points: TiePoints,
+    known: Mapping[str, Array],
+    used: set[str],
+    convert: Callable[[Array], Array],
+) -> Iterator[PointResidual]:
+    """Residuals with roles, and with the errors of surveyed points.
+
+    Args:
+        found: From `residuals`.
+        tie_points: The points.
+        known: Surveyed coordinates in the frame of the model.
+        used: Names of the control that the model was moved to.
+        convert: Coordinates of the model to those of the output. [N, 3] -> [N, 3]
+    """
+    roles = {p.name: p.role for p in tie_points.points}
+    for one in found:
+        role = replace(one, role=roles[one.name], used=one.name in used)
+        if one.name in known:
+            surveyed = convert(known[one.name][None])[0]
+            role = replace(role, surveyed=_place(surveyed))
+            if one.place is not None:
+                error = convert(np.array([one.place]))[0] - surveyed
+                role = replace(role, error=_place(error))
+        yield role
+
+
+def _place(xyz: Array) -> Place:
+    x, y, z = xyz.tolist()
+    return x, y, z

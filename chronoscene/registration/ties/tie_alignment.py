@@ -2,7 +2,8 @@
 
 Each period places the tie points by its own images. Two periods that share three or more points
 that are not collinear are aligned by the similarity between them; ground control moves the whole
-model. Points that do not fit are named.
+model, in a local frame without map projection. Check points are only compared. Points that do not
+fit are named.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
-from chronoscene.geodesy import Georeference
+from chronoscene.geodesy import Georeference, ReferenceSystem
 from chronoscene.registration.quality.rays import model_rays, place
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import (
@@ -26,6 +27,7 @@ from chronoscene.registration.ties.residuals import (
     moved,
     place_clicks,
     residuals,
+    with_errors,
     with_tie_tracks,
 )
 from chronoscene.registration.ties.tie_points import TiePoints, match_images
@@ -58,34 +60,61 @@ class TieAlignment:
 
 
 def align_with_tie_points(
-    model: Registered, tie_points: TiePoints, *, mode: Mode = "auto"
+    model: Registered,
+    tie_points: TiePoints,
+    *,
+    mode: Mode = "auto",
+    output: ReferenceSystem | None = None,
 ) -> TieAlignment:
     """Check a registration by tie points and, where it fails, align its periods by them.
+
+    Ground control in a reference system georeferences a model that is not.
 
     Args:
         model: Its periods may be in frames of their own.
         tie_points: From `chronoscene.registration.ties.tie_points.read_tie_points`.
         mode: ``check`` only moves the whole model to ground control; ``replace`` also aligns all
             periods again; ``auto`` does so if the points do not fit.
+        output: Reference system of the errors; None for the frame of the model.
 
     Raises:
         SceneError: If periods must be aligned and the points do not suffice.
     """
-    clicks, remarks = clicks_of(model, tie_points)
-    control = tie_points.located(model.georeference)
+    every, remarks = clicks_of(model, tie_points)
+    clicks = every.without(tie_points.names("check"))
     error = misfit(model, clicks)
-    replaced = mode == "replace" or (mode == "auto" and not error <= GOOD_PIXELS)
+    bad = _are_shared(model, clicks) and not error <= GOOD_PIXELS
+    replaced = mode == "replace" or (mode == "auto" and bad)
     if replaced:
         remarks.append(f"alignment replaced: tie points were off by {error:.1f} px (median)")
         model, more = _align_periods(model, clicks, tie_points)
         remarks += more
-    model, controlled, more = _to_control(model, clicks, control)
-    found = tuple(residuals(model, clicks, control if controlled else {}))
+    frame = model.georeference or control_frame(tie_points)
+    known = tie_points.located(frame)
+    control = {name: known[name] for name in tie_points.names("control") & known.keys()}
+    there, used, more = _to_control(model, clicks, control)
+    if used and model.georeference is None and tie_points.crs is not None:
+        there = replace(there, georeference=frame, gps_enu=np.full_like(model.gps_enu, np.nan))
+    if not used and model.georeference is None:
+        known = {}  # the place of the model is unknown
+
+    def convert(xyz: Array) -> Array:
+        if output is None or there.georeference is None:
+            return xyz
+        return output.from_local(there.georeference, xyz)
+
+    found = tuple(with_errors(residuals(there, every), tie_points, known, used, convert))
     named = [r.name for r in found if r.outlier]
     remarks += more + ([f"outliers: {', '.join(named)}"] if named else [])
     return TieAlignment(
-        model, replaced=replaced, controlled=controlled, residuals=found, remarks=tuple(remarks)
+        there, replaced=replaced, controlled=bool(used), residuals=found, remarks=tuple(remarks)
     )
+
+
+def _are_shared(model: Registered, clicks: Clicks) -> bool:
+    """Return True if any point is clicked in images of several periods."""
+    pairs = np.column_stack([clicks.rays.track, model.periods[clicks.rays.image]])
+    return bool((np.bincount(np.unique(pairs, axis=0)[:, 0]) > 1).any())
 
 
 def _align_periods(
@@ -164,10 +193,10 @@ def move_periods(model: Registered, moves: dict[int, Sim3]) -> Registered:
 
 def _to_control(
     model: Registered, clicks: Clicks, control: dict[str, Array]
-) -> tuple[Registered, bool, list[str]]:
-    """Move the whole model to ground control, if there is enough of it."""
+) -> tuple[Registered, set[str], list[str]]:
+    """Move the whole model to ground control, if there is enough of it; the points used."""
     if not control:
-        return model, False, []
+        return model, set(), []
     placed = place_clicks(moved(clicks.rays, model))
     known = [(i, clicks.names[t]) for i, t in enumerate(placed.track) if clicks.names[t] in control]
     source = placed.xyz[[i for i, _ in known]].reshape(-1, 3)
@@ -177,7 +206,7 @@ def _to_control(
         remark = (
             f"{len(known)} control points can be placed; three that are not collinear are needed"
         )
-        return model, False, [remark]
+        return model, set(), [remark]
     move, used = found
     rejected = [name for (_, name), u in zip(known, used, strict=True) if not u]
     note = f"; without {', '.join(rejected)}" if rejected else ""
@@ -186,40 +215,32 @@ def _to_control(
         points=move.apply(model.points),
         cam_from_world=move.apply_to_pose(model.cam_from_world),
     )
-    return there, True, [f"moved to {int(used.sum())} control points{note}"]
+    kept = {name for (_, name), u in zip(known, used, strict=True) if u}
+    return there, kept, [f"moved to {len(kept)} control points{note}"]
 
 
-def tie(model: Registered, points: TiePoints, refine: Refine) -> TieAlignment:
-    """Check a registration by tie points; align and adjust it by them where they do not fit.
-
-    Ground control in a reference system georeferences a model that is not.
-    """
-    framed = model
-    if model.georeference is None and (frame := control_frame(points)) is not None:
-        framed = replace(model, georeference=frame, gps_enu=np.full_like(model.gps_enu, np.nan))
-    first = align_with_tie_points(framed, points, mode="replace" if model.unplaced else "auto")
+def tie(
+    model: Registered, points: TiePoints, refine: Refine, output: ReferenceSystem | None = None
+) -> TieAlignment:
+    """Check a registration by tie points; align and adjust it by them where they do not fit."""
+    mode: Mode = "replace" if model.unplaced else "auto"
+    first = align_with_tie_points(model, points, mode=mode, output=output)
     if not first.replaced:
-        return _unless_placed(first, model)
+        return first
     adjusted = refine(refine_arguments(first.model, points))
-    adjusted = replace(adjusted, georeference=framed.georeference, gps_enu=framed.gps_enu)
-    last = align_with_tie_points(adjusted, points, mode="check")
-    both = replace(last, replaced=True, remarks=(*first.remarks, *last.remarks))
-    return _unless_placed(both, model)
-
-
-def _unless_placed(result: TieAlignment, before: Registered) -> TieAlignment:
-    """Drop the georeference if there was no control to move the model into its frame."""
-    if result.controlled or before.georeference is not None:
-        return result
-    return replace(result, model=replace(result.model, georeference=None))
+    adjusted = replace(adjusted, georeference=model.georeference, gps_enu=model.gps_enu)
+    last = align_with_tie_points(adjusted, points, mode="check", output=output)
+    return replace(last, replaced=True, remarks=(*first.remarks, *last.remarks))
 
 
 def control_frame(points: TiePoints) -> Georeference | None:
     """Local frame around the ground control; None without control in a reference system."""
-    if points.crs is None or not any(p.world is not None for p in points.points):
+    control = points.names("control")
+    if points.crs is None or not control:
         return None
     anywhere = Georeference(latitude=0.0, longitude=0.0, height=0.0, height_kind="as stated")
-    places = anywhere.to_geodetic(np.stack(list(points.located(anywhere).values())))
+    known = points.located(anywhere)
+    places = anywhere.to_geodetic(np.stack([known[name] for name in sorted(control)]))
     latitude, longitude, height = np.median(places, axis=0).tolist()
     return Georeference(
         latitude=round(latitude, 7),

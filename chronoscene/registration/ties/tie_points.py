@@ -1,8 +1,9 @@
 """Files of tie points and ground control that a person clicked.
 
-Two forms are read. A CSV has a row for each click: point id, image, x, y, and for ground control
-also the point's world coordinates. OpenDroneMap's ``gcp_list.txt`` has a line with the projection,
-then ``geo_x geo_y geo_z im_x im_y image_name [gcp_name]`` for each click. Pixels are those of the
+Two forms are read. A CSV has a row for each click: point id, image, x, y, and for surveyed points
+also their world coordinates and their role: control, or check. OpenDroneMap's ``gcp_list.txt`` has
+a line with the projection, then ``geo_x geo_y geo_z im_x im_y image_name [gcp_name]`` for each
+click; check points have names that start with ``CHK-``. Pixels are those of the
 photo as stored, without its orientation tag applied; the corner of the image is (0, 0).
 """
 
@@ -10,16 +11,16 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
-from chronoscene.geodesy import Georeference
+from chronoscene.geodesy import Georeference, ReferenceSystem, read_reference_system
 from chronoscene.io.documents import read_text
 
 COLUMNS = {
@@ -30,11 +31,19 @@ COLUMNS = {
     "world x": ("world x", "world_x", "wx", "geo_x", "east", "longitude"),
     "world y": ("world y", "world_y", "wy", "geo_y", "north", "latitude"),
     "world z": ("world z", "world_z", "wz", "geo_z", "up", "height", "altitude"),
+    "role": ("role",),
 }
 """Names of columns, in lower case; upper-case X, Y, Z are world coordinates."""
 
 _TODO_CSV = "write lines such as: corner1,2016/IMG_0001.jpg,812.5,334.0"
 _TODO_ODM = "write lines such as: 544256.7 5320919.9 5.0 3044.5 2622.0 IMG_0525.jpg gcp01"
+
+
+Role = Literal["tie", "control", "check"]
+"""``control`` places the model in the world, ``check`` takes no part in the estimation, and ``tie``
+has no world coordinates."""
+
+CHECK_PREFIX = "CHK-"  # Of the names of check points in OpenDroneMap's lists
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +66,8 @@ class TiePoint:
     name: str
     clicks: tuple[Click, ...]
     world: tuple[float, float, float] | None
-    """World coordinates of ground control, in the file's reference system."""
+    """Surveyed coordinates, in the file's reference system."""
+    role: Role
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,37 +77,45 @@ class TiePoints:
     path: Path
     points: tuple[TiePoint, ...]
     """Sorted by name."""
-    crs: str | None
-    """Reference system of the world coordinates as PROJ reads it; None for that of the model."""
+    crs: ReferenceSystem | None
+    """Reference system of the world coordinates; None for that of the model."""
 
-    def located(self, georeference: Georeference | None) -> dict[str, Array]:
-        """World coordinates of the ground control in the frame of a model. Name -> [3]
+    def names(self, role: Role) -> set[str]:
+        """Names of the points of a role."""
+        return {p.name for p in self.points if p.role == role}
+
+    def located(self, frame: Georeference | None) -> dict[str, Array]:
+        """Surveyed coordinates in a local frame; none if there is no frame. Name -> [3]
 
         Raises:
-            SceneError: If the file names a reference system and the model has none, or PROJ does
-                not know it.
+            SceneError: If points lie outside of the area of the reference system.
         """
         known = {p.name: p.world for p in self.points if p.world is not None}
         if self.crs is None or not known:
             return {name: np.array(xyz) for name, xyz in known.items()}
-        if georeference is None:
+        if frame is None:
+            return {}
+        enu = self.crs.to_local(frame, np.array(list(known.values())))
+        lost = [n for n, place in zip(known, enu, strict=True) if not np.isfinite(place).all()]
+        if lost:
             raise SceneError(
                 self.path,
-                expected="world coordinates in the frame of the model, which is not georeferenced",
-                found=f"coordinates in {self.crs}",
-                todo="leave out the reference system: the model is then moved to the coordinates",
+                expected=f"world coordinates that lie within {self.crs.text}",
+                found=f"{list(known[lost[0]])} of {lost[0]}",
+                todo="check the reference system, and the order east, north, height",
             )
-        geodetic = _geodetic(self.path, self.crs, np.array(list(known.values())))
-        enu = georeference.to_enu(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2])
         return dict(zip(known, enu, strict=True))
 
 
-def read_tie_points(path: Path, *, scale: float = 1.0) -> TiePoints:
+def read_tie_points(
+    path: Path, *, scale: float = 1.0, crs: ReferenceSystem | None = None
+) -> TiePoints:
     """Read tie points or ground control from a CSV or from ODM's ``gcp_list.txt``.
 
     Args:
         path: The file.
         scale: Size of the photos in units of those that were clicked in.
+        crs: Reference system, if the file names none.
 
     Raises:
         SceneError: If a line is wrong; the message names it.
@@ -107,7 +125,7 @@ def read_tie_points(path: Path, *, scale: float = 1.0) -> TiePoints:
     if not filled:
         raise SceneError(path, expected="tie points", found="an empty file", todo=_TODO_CSV)
     if re.match(r"(\+proj|EPSG:|WGS84)", filled[0][1], re.IGNORECASE):
-        crs: str | None = _projection(path, filled[0][1])
+        crs = _projection(path, filled[0][1])
         rows = _odm_rows(path, filled[1:])
     else:
         named = (
@@ -115,20 +133,21 @@ def read_tie_points(path: Path, *, scale: float = 1.0) -> TiePoints:
             for n, line in filled
             if (found := re.fullmatch(r"#\s*crs\s*[:=]\s*(.+)", line, re.IGNORECASE))
         )
-        crs = next((_checked_crs(f"{path}:{n}", text) for n, text in named), None)
+        crs = next((read_reference_system(f"{path}:{n}", text) for n, text in named), crs)
         rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")])
-    scaled = ((p, replace(c, x=scale * c.x, y=scale * c.y), w) for p, c, w in rows)
+    scaled = ((p, replace(c, x=scale * c.x, y=scale * c.y), w, r) for p, c, w, r in rows)
     return _assemble(path, scaled, crs)
 
 
-_Row = tuple[str, Click, tuple[float, float, float] | None]
+_Row = tuple[str, Click, tuple[float, float, float] | None, Role | None]
 
 
-def _assemble(path: Path, rows: Iterator[_Row], crs: str | None) -> TiePoints:
-    """Group clicks by point; refuse two places of one point, in an image or in the world."""
+def _assemble(path: Path, rows: Iterable[_Row], crs: ReferenceSystem | None) -> TiePoints:
+    """Group clicks by point; refuse two places or two roles of one point."""
     clicks: dict[str, dict[str, Click]] = {}
     worlds: dict[str, tuple[float, float, float]] = {}
-    for name, click, world in rows:
+    roles: dict[str, Role] = {}
+    for name, click, world, role in rows:
         mine = clicks.setdefault(name, {})
         if click.image in mine:
             raise _wrong(
@@ -141,8 +160,23 @@ def _assemble(path: Path, rows: Iterator[_Row], crs: str | None) -> TiePoints:
                 path, click.line, f"the same world coordinates of point {name!r} on all its lines",
                 f"{world} after {worlds[name]}", "correct them, or give the points two names",
             )  # fmt: skip
+        if role is not None and name not in worlds:
+            raise _wrong(
+                path, click.line, f"world coordinates of the {role} point {name!r}", "none",
+                "add them, or leave the role empty",
+            )  # fmt: skip
+        if role is not None and roles.setdefault(name, role) != role:
+            raise _wrong(
+                path, click.line, f"the same role of point {name!r} on all its lines",
+                f"{role} after {roles[name]}", "correct one of them",
+            )  # fmt: skip
     points = tuple(
-        TiePoint(name, tuple(mine.values()), worlds.get(name))
+        TiePoint(
+            name,
+            tuple(mine.values()),
+            worlds.get(name),
+            roles.get(name, "control" if name in worlds else "tie"),
+        )
         for name, mine in sorted(clicks.items())
     )
     if not points:
@@ -154,7 +188,7 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
     cells = [(n, [c.strip() for c in next(csv.reader([line]))]) for n, line in lines]
     order = _header(path, *cells[0]) if cells else None
     if order is None:
-        names = ("point", "image", "x", "y", "world x", "world y", "world z")
+        names = ("point", "image", "x", "y", "world x", "world y", "world z", "role")
         order = {name: i for i, name in enumerate(names)}
     else:
         cells = cells[1:]
@@ -166,8 +200,8 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
         if not point or not image:
             raise _wrong(path, number, "a point id and an image", f"{row[:4]}", _TODO_CSV)
         xy = [_number(path, number, row[order[name]], name) for name in ("x", "y")]
-        places = [order.get(name, len(row)) for name in ("world x", "world y", "world z")]
-        world = [row[i] for i in places if i < len(row) and row[i]]
+        cell = {name: row[i] for name, i in order.items() if i < len(row)}
+        world = [cell[name] for name in ("world x", "world y", "world z") if cell.get(name)]
         if len(world) not in (0, 3):
             raise _wrong(
                 path, number, "three world coordinates, or none", f"{len(world)}", _TODO_CSV
@@ -177,7 +211,16 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
             point,
             Click(image, xy[0], xy[1], line=number),
             (xyz[0], xyz[1], xyz[2]) if xyz else None,
+            _role(path, number, cell.get("role", "")),
         )
+
+
+def _role(path: Path, number: int, text: str) -> Role | None:
+    """Role in a field; None if it is empty."""
+    known: dict[str, Role | None] = {"": None, "control": "control", "check": "check"}
+    if text.lower() not in known:
+        raise _wrong(path, number, "the role control or check", repr(text[:40]), "correct the line")
+    return known[text.lower()]
 
 
 def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | None:
@@ -218,50 +261,18 @@ def _odm_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
         )
         # Without a name, a point is known by where it is.
         point = fields[6] if len(fields) > 6 and fields[6] else f"{fields[0]} {fields[1]}"
-        yield point, Click(fields[5], u, v, line=number), (x, y, z)
+        role: Role = "check" if point.startswith(CHECK_PREFIX) else "control"
+        yield point, Click(fields[5], u, v, line=number), (x, y, z), role
 
 
-def _projection(path: Path, line: str) -> str:
+def _projection(path: Path, line: str) -> ReferenceSystem:
     """Read the first line of ``gcp_list.txt``: PROJ, EPSG, or ``WGS84 UTM 32N``."""
+    text = "EPSG:4326" if line.upper() == "WGS84" else line
     if utm := re.fullmatch(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", line, re.IGNORECASE):
         zone = int(utm[1])
         if 1 <= zone <= 60:
-            return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + zone}"
-    return _checked_crs(f"{path}:1", "EPSG:4326" if line.upper() == "WGS84" else line)
-
-
-def _checked_crs(place: str, text: str) -> str:
-    import pyproj
-
-    try:
-        pyproj.CRS.from_user_input(text)
-    except pyproj.exceptions.CRSError as error:
-        raise SceneError(
-            place,
-            expected="a reference system that PROJ knows, such as EPSG:32632 or WGS84 UTM 32N",
-            found=repr(text[:80]),
-            todo="correct it",
-        ) from error
-    return text
-
-
-def _geodetic(path: Path, crs: str, xyz: Array) -> Array:
-    """Longitude, latitude (degrees) and height of points in a reference system. [N, 3]"""
-    import pyproj
-
-    source = pyproj.CRS.from_user_input(crs)
-    # Heights stay as they are: geoid grids are not at hand, and photos mix the kinds anyway.
-    flat: Any = pyproj.Transformer.from_crs(source, "EPSG:4326", always_xy=True)
-    longitude, latitude = flat.transform(xyz[:, 0], xyz[:, 1])
-    out = np.column_stack([longitude, latitude, xyz[:, 2]])
-    if not np.isfinite(out).all():
-        raise SceneError(
-            path,
-            expected=f"world coordinates that lie within {crs}",
-            found=str(xyz[~np.isfinite(out).all(axis=1)][0].tolist()),
-            todo="check the reference system, and the order east, north, height",
-        )
-    return out
+            text = f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + zone}"
+    return read_reference_system(f"{path}:1", text)
 
 
 def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int | None]:

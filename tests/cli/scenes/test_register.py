@@ -28,13 +28,12 @@ def photos(folder: Path, count: int) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("level", "status"), [("pass", 0), ("doubtful", 0), ("fail", 1)])
-def test_the_verdict_decides_on_the_exit_status(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, level: str, status: int
+@pytest.mark.parametrize("failed", [False, True])
+def test_the_verdicts_decide_on_the_exit_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failed: bool
 ) -> None:
     def run(*inputs: Any, inspected: Any, **options: Any) -> Any:
-        verdict = SimpleNamespace(level=level)
-        inspected(SimpleNamespace(verdict=verdict, summary=f"verdict: {level}\n"))
+        inspected(SimpleNamespace(failed=failed, summary="absolute position: pass\n"))
         return SimpleNamespace(
             route="joint",
             unit="metre",
@@ -43,15 +42,17 @@ def test_the_verdict_decides_on_the_exit_status(
             unregistered_periods={"b/1.jpg": 1},
             unregistered={"b/1.jpg": "no matches"},
             points=np.zeros((5, 3)),
+            georeference=None,
         )
 
     photos(tmp_path / "in/a", 2)
     photos(tmp_path / "in/b", 2)
     monkeypatch.setattr(register, "run", run)
-    done = call(tmp_path / "in", tmp_path / "out")
-    assert done.exit_code == status, done.output
+    done = call(tmp_path / "in", tmp_path / "out", "--crs", "EPSG:32632")
+    assert done.exit_code == failed, done.output
     assert "period 1 (b): 1 of 2 photos registered" in done.output
-    assert "b/1.jpg: no matches" in done.output and f"verdict: {level}" in done.output
+    assert "b/1.jpg: no matches" in done.output and "absolute position" in done.output
+    assert "no coordinates in EPSG:32632" in done.output
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -132,3 +133,16 @@ def test_a_run_that_ends_early_says_what_the_work_folder_is_kept_for(
     assert (tmp_path / "out.work").is_dir()
     if end is None:
         assert isinstance(done.exception, RegistrationError)
+
+
+@pytest.mark.parametrize(
+    ("crs", "found"),
+    [("EPSG:4326", "in degrees"), ("EPSG:32632+5773", "a geoid"), ("here", "'here'")],
+)
+def test_the_reference_system_is_checked_before_any_work(
+    tmp_path: Path, crs: str, found: str
+) -> None:
+    done = call(photos(tmp_path / "in/a", 3).parent, tmp_path / "out", "--crs", crs)
+    assert isinstance(done.exception, ConfigError), done.output
+    assert done.exception.place == "--crs" and found in done.exception.found
+    assert [p.name for p in tmp_path.iterdir()] == ["in"]

@@ -136,3 +136,32 @@ def test_nothing_to_register_is_said(tmp_path: Path) -> None:
     (tmp_path / "x.jpg").write_text("no photo")
     with pytest.raises(SceneError, match=r"1 files, none usable \(cannot be decoded"):
         read_captures(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("photos", "named", "dates"),
+    [
+        ({"2016": ("2016:03:01", "2018:05:03")}, ["2016/1.jpg: 2018-05-03"], ["2016-03-01"]),
+        ({"2016-03": ("2018:05:03",) * 2}, ["2 of 2", "2016-03/0.jpg"], ["2016-03"]),
+        ({"2016-03-01": ("2016:03:01", "2016:03:04")}, [], ["2016-03"]),
+        ({"2022-05-01": ("2022:05:01", "2022:05:11"), "2022-05-11": ("2022:05:11",)},
+         ["2022-05-01/1.jpg"], ["2022-05-01", "2022-05-11"]),
+        ({"before": ("2016:03:01",) * 4 + ("2018:05:03",), "after": ("2018:05:03",) * 2},
+         ["before/4.jpg"], ["2016-03-01", "2018-05-03"]),
+        ({"before": ("2016:03:01", "2016:09:01"), "after": ("2016:06:01",) * 2}, [], None),
+    ],
+)  # fmt: skip
+def test_photos_whose_date_contradicts_their_period_are_named(
+    tmp_path: Path, photos: dict[str, tuple[str, ...]], named: list[str], dates: list[str] | None
+) -> None:
+    for label, days in (photos | {"2030": ()}).items():
+        photo(tmp_path / label / "undated.jpg")
+        for i, day in enumerate(days):
+            photo(tmp_path / label / f"{i}.jpg", taken=f"{day} 10:00:00")
+    found = read_captures(tmp_path)
+    assert bool(found.misdated) == bool(named)
+    assert all(words in found.misdated[0] for words in named)
+    assert set(found.misdated) <= set(found.remarks)
+    if dates is not None:
+        known = {p.label: p.date for p in found.periods}
+        assert [known[label] for label in photos] == dates

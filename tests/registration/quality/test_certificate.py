@@ -18,6 +18,7 @@ from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment, Transfers
 from chronoscene.registration.quality.overlap import tie_spread
+from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position
 from chronoscene.registration.quality.rays import PlacedPoints, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.quality.verdict import THRESHOLDS, judge
@@ -25,6 +26,8 @@ from chronoscene.registration.report.certificate_json import pair_figures, perio
 from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3
+
+PLACED = Position("doubtful", "By GPS.", (), check=None, control=None, gps=None, ground_pixel=None)
 
 GOOD = CaseSettings(ties=800, seed=21, held_out=0.3)
 
@@ -67,8 +70,8 @@ def test_every_figure_is_measured(certificate: Certificate) -> None:
 
 def test_equal_models_give_equal_certificates(good: Registered, certificate: Certificate) -> None:
     again = certify(good)
-    assert json.dumps(to_json(again, judge(again))) == json.dumps(
-        to_json(certificate, judge(certificate))
+    assert json.dumps(to_json(again, judge(again), PLACED)) == json.dumps(
+        to_json(certificate, judge(certificate), PLACED)
     )
 
 
@@ -179,7 +182,7 @@ def test_a_period_without_any_image(good: Registered) -> None:
     verdict = judge(certificate)
     assert verdict.level == "fail"
     assert any(f.place == "period c" and f.check == "images" for f in verdict.objections)
-    json.dumps(to_json(certificate, verdict), allow_nan=False)
+    json.dumps(to_json(certificate, verdict, PLACED), allow_nan=False)
 
 
 def test_one_image(good: Registered) -> None:
@@ -199,12 +202,13 @@ def test_one_image(good: Registered) -> None:
     )
     certificate = certify(model)
     assert judge(certificate).level == "fail"
-    json.dumps(to_json(certificate, judge(certificate)), allow_nan=False)
+    json.dumps(to_json(certificate, judge(certificate), PLACED), allow_nan=False)
 
 
 def test_json_has_units_numbers_and_reasons(certificate: Certificate) -> None:
-    data = json.loads(json.dumps(to_json(certificate, judge(certificate)), allow_nan=False))
-    assert data["verdict"] == "pass"
+    data = json.loads(json.dumps(to_json(certificate, judge(certificate), PLACED), allow_nan=False))
+    assert data["alignment"]["verdict"] == "pass"
+    assert data["absolute_position"]["verdict"] == "doubtful"
     assert data["unit"] == "metre"
     figures = {f["name"]: f for f in data["pairs"][0]["figures"]}
     assert figures["rotation by held-out tracks"]["unit"] == "degrees"
@@ -370,7 +374,7 @@ def test_extent_of_cameras_that_stand_still(good: Registered) -> None:
 
 def test_the_documented_thresholds_are_those_of_the_code() -> None:
     text = (Path(__file__).parents[3] / "docs/reference/certificate.md").read_text(encoding="utf-8")
-    for t in THRESHOLDS.values():
+    for t in (*THRESHOLDS.values(), *POSITION_THRESHOLDS.values()):
         sign = "below" if t.larger_is_better else "above"
         unit = f" {t.unit}" if t.unit else ""
         fail = f"{sign} {t.fail:g}{unit}" if t.fail is not None else "-"

@@ -17,6 +17,7 @@ from PIL import Image
 from benchmarks.registration.generated import CaseSettings, generate_case
 from chronoscene.registration.output import inspect_registration
 from chronoscene.registration.quality.certificate import certify
+from chronoscene.registration.quality.position import judge_position
 from chronoscene.registration.quality.rays import gather
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.report.page import render_report
@@ -64,7 +65,7 @@ class Collector(HTMLParser):
 
 def render(model: Registered) -> str:
     certificate = certify(model)
-    return render_report(model, certificate, judge(certificate))
+    return render_report(model, certificate, judge(certificate), judge_position(model))
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +85,8 @@ def test_page_is_complete_in_itself(page: str) -> None:
 def test_page_says_what_was_measured(model: Registered, page: str) -> None:
     verdict = judge(certify(model))
     assert verdict.level == "fail"
-    assert '<h2 class="badge fail">Fail</h2>' in page
+    assert 'Alignment of the periods: <span class="badge fail">Fail</span>' in page
+    assert 'Absolute position: <span class="badge doubtful">Doubtful</span>' in page
     assert "remaining rotation between two periods" in page
     for heading in (
         "Cameras from above", "The same spot at two dates", "Held-out matches",
@@ -188,8 +190,10 @@ def test_map_has_north_up_and_cuts_gross_gps(model: Registered) -> None:
 def test_inspection_writes_json_and_page(model: Registered, tmp_path: Path) -> None:
     found = inspect_registration(model, tmp_path, page=True)
     data = json.loads((tmp_path / "registration.json").read_text())
-    assert data["verdict"] == found.verdict.level == "fail"
-    assert found.summary.startswith("verdict: fail. The periods do not fit")
+    assert data["alignment"]["verdict"] == found.verdict.level == "fail"
+    assert data["absolute_position"]["verdict"] == found.position.level == "doubtful"
+    assert found.summary.startswith("alignment of the periods: fail. The periods do not fit")
+    assert "\nabsolute position: doubtful. " in found.summary
     assert "to do: " in found.summary
     assert "<h2" in (tmp_path / "registration.html").read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["registration.html", "registration.json"]
@@ -207,7 +211,7 @@ def test_tie_points_are_listed(model: Registered, tmp_path: Path) -> None:
     ties = align_with_tie_points(model, points, mode="check")
     inspect_registration(ties.model, tmp_path, page=True, ties=ties, tie_points=points)
     page = (tmp_path / "registration.html").read_text()
-    assert "Clicked tie points" in page and "<td>p35</td>" in page
+    assert "Clicked points" in page and "click consistency, px" in page and "<td>p35</td>" in page
     assert json.loads((tmp_path / "registration.json").read_text())["tie_points"]["points"]
 
 

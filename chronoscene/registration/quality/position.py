@@ -1,0 +1,240 @@
+"""Absolute position of a registration in the world: measured, and judged apart from the alignment.
+
+A model whose periods fit each other perfectly can be metres off in the world. Check points, which
+took no part in the estimation, measure that. Control points show only how well the model could be
+moved to them, and GPS is as good as the receiver: neither proves a position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from chronoscene.arrays import Array
+from chronoscene.registration.quality.verdict import Level, Objection, Threshold, check, worst_level
+from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.residuals import PointResidual
+from chronoscene.registration.ties.tie_alignment import TieAlignment
+from chronoscene.scene.geometry import camera_centre
+
+_COMPARE = (
+    "compare the reference system, the coordinates and the clicks of the points with the largest "
+    "errors (control.csv)"
+)
+_CHECK = "set some surveyed points aside as check points: role check in the file of --tie-points"
+
+POSITION_THRESHOLDS: dict[str, Threshold] = {
+    "horizontal": Threshold(
+        what="horizontal RMSE",
+        unit="ground pixels", doubtful=2, fail=6,
+        why="twice the pixel on the ground is the ASPRS class for mapping; clicks are precise to "
+        "about one",
+        todo=_COMPARE,
+    ),
+    "vertical": Threshold(
+        what="vertical RMSE",
+        unit="ground pixels", doubtful=3, fail=9,
+        why="rays of neighbouring photos intersect at small angles, so heights are less precise",
+        todo=_COMPARE,
+    ),
+    "points": Threshold(
+        what="check points",
+        doubtful=3, larger_is_better=True,
+        why="fewer say nothing about a tilt of the model",
+        todo=_CHECK,
+    ),
+    "gps": Threshold(
+        what="horizontal distance of the surveyed position from GPS, median",
+        unit="m", doubtful=15, fail=100,
+        why="receivers err by metres; more comes from another reference system, or exchanged axes",
+        todo="check the reference system of the points, and the order east, north, height",
+    ),
+}  # fmt: skip
+"""The fail limits of the errors are three times the doubtful ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rmse:
+    """Root mean square errors of points or cameras, in metres."""
+
+    count: int
+    horizontal: float
+    vertical: float
+    worst: str
+    """Name of the one with the largest error."""
+    largest: float
+    """Its distance."""
+
+    @property
+    def text(self) -> str:
+        """The errors in words."""
+        return (
+            f"{self.horizontal:.3g} m horizontal, {self.vertical:.3g} m vertical (RMSE of "
+            f"{self.count}; largest {self.largest:.3g} m, {self.worst})"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """The judgement on the absolute position."""
+
+    level: Level | Literal["not checked"]
+    text: str
+    """One or two sentences."""
+    objections: tuple[Objection, ...]
+    """The most severe first."""
+    check: Rmse | None
+    """Points that took no part in the estimation."""
+    control: Rmse | None
+    """Points that the model was moved to: optimistic."""
+    gps: Rmse | None
+    """Cameras against their GPS positions."""
+    ground_pixel: float | None
+    """Metres that a pixel covers, median over the surveyed points."""
+
+    @property
+    def todo(self) -> tuple[str, ...]:
+        """Things to do, without repetition, the most important first."""
+        return tuple(dict.fromkeys(f.todo for f in self.objections))
+
+    @property
+    def lines(self) -> list[tuple[str, Rmse]]:
+        """The errors that were measured, with what they are errors of."""
+        named = (
+            ("check points", self.check),
+            ("control points, which the model was fitted to", self.control),
+            ("cameras against GPS", self.gps),
+        )
+        return [(name, rmse) for name, rmse in named if rmse is not None]
+
+
+def judge_position(model: Registered, ties: TieAlignment | None = None) -> Position:
+    """Judge where a registration lies in the world, by the best measurement there is.
+
+    Args:
+        model: The registration, after alignment by tie points.
+        ties: Result of the alignment by tie points.
+    """
+    points = [] if ties is None else [r for r in ties.residuals if r.error is not None]
+    controlled = ties is not None and ties.controlled
+    # Control that could not move the model is as independent as check points.
+    checks = [r for r in points if r.role == "check" or not controlled]
+    used = [r for r in points if r.used]
+    found, control, gps = _of_points(checks), _of_points(used), _gps(model)
+    pixels = [r.ground_pixel for r in points if r.ground_pixel is not None]
+    pixel = float(np.median(pixels)) if pixels else None
+    objections = [
+        *_errors("check points", found, pixel),
+        *_errors("control points", control, pixel),
+    ]
+    objections += _rejected(
+        [r for r in points if r.role == "control" and controlled and not r.used]
+    )
+    if found is not None:
+        objections += check(POSITION_THRESHOLDS["points"], found.count, "check points", "points")
+    if points and gps is not None:
+        gap = float(np.linalg.norm(_gps_gap(model)))
+        objections += check(POSITION_THRESHOLDS["gps"], gap, "ground control and GPS", "gps")
+    objections += _unproven(found, control, gps)
+    objections.sort(key=lambda f: f.level != "fail")
+    level: Level | Literal["not checked"] = worst_level(f.level for f in objections)
+    if found is None and control is None and gps is None:
+        level = "not checked"
+    text = _words(level, objections, found, ties)
+    return Position(level, text, tuple(objections), found, control, gps, pixel)
+
+
+def _of_points(points: Sequence[PointResidual]) -> Rmse | None:
+    return _rmse([r.name for r in points], np.array([r.error for r in points]))
+
+
+def _rmse(names: Sequence[str], errors: Array) -> Rmse | None:
+    if not len(names):
+        return None
+    distance = np.linalg.norm(errors, axis=1)
+    square = np.mean(errors**2, axis=0)
+    worst = int(np.argmax(distance))
+    return Rmse(
+        count=len(names),
+        horizontal=float(np.sqrt(square[0] + square[1])),
+        vertical=float(np.sqrt(square[2])),
+        worst=names[worst],
+        largest=float(distance[worst]),
+    )
+
+
+def _gps(model: Registered) -> Rmse | None:
+    """Errors of the cameras against the GPS positions that took part in the estimation."""
+    use = np.flatnonzero(model.gps_used & np.isfinite(model.gps_enu).all(axis=1))
+    if model.georeference is None:
+        return None
+    errors = camera_centre(model.cam_from_world[use]) - model.gps_enu[use]
+    return _rmse([model.names[i] for i in use], errors)
+
+
+def _gps_gap(model: Registered) -> Array:
+    """Median of the cameras minus their GPS positions, east and north, metres. [2]"""
+    use = model.gps_used & np.isfinite(model.gps_enu).all(axis=1)
+    gaps = camera_centre(model.cam_from_world[use]) - model.gps_enu[use]
+    return np.asarray(np.median(gaps[:, :2], axis=0))
+
+
+def _errors(place: str, rmse: Rmse | None, pixel: float | None) -> Iterator[Objection]:
+    """Objections to the errors of points, in pixels on the ground."""
+    if rmse is None or not pixel:
+        return
+    for key, value in (("horizontal", rmse.horizontal), ("vertical", rmse.vertical)):
+        note = f" ({value:.3g} m; largest error {rmse.largest:.3g} m, {rmse.worst})"
+        yield from check(POSITION_THRESHOLDS[key], value / pixel, place, key, note)
+
+
+def _rejected(points: Sequence[PointResidual]) -> Iterator[Objection]:
+    """Control points that do not fit the others."""
+    for r in points:
+        found = f"{np.linalg.norm(r.error or 0.0):.3g} m off, so it was left out"
+        yield Objection(
+            "doubtful", "outlier", f"control point {r.name}", found,
+            "the other control points agree with each other, but not with it", _COMPARE,
+        )  # fmt: skip
+
+
+def _unproven(found: Rmse | None, control: Rmse | None, gps: Rmse | None) -> Iterator[Objection]:
+    """An objection where nothing but the estimation itself speaks for a position."""
+    if found is not None:
+        return
+    if control is not None:
+        yield Objection(
+            "doubtful", "independent", "control points",
+            f"{control.text}; there are no check points",
+            "the model was fitted to these points, so their errors are optimistic", _CHECK,
+        )  # fmt: skip
+    elif gps is not None:
+        yield Objection(
+            "doubtful", "independent", "GPS", f"cameras differ from it by {gps.text}",
+            "an error that all positions share, of metres for a consumer receiver and in height, "
+            "does not show", "give surveyed points: --tie-points with world coordinates",
+        )  # fmt: skip
+
+
+def _words(
+    level: str, objections: Sequence[Objection], found: Rmse | None, ties: TieAlignment | None
+) -> str:
+    if level == "not checked":
+        why = "there is no ground control, and GPS was not used"
+        if ties is not None and any(r.role != "tie" for r in ties.residuals):
+            why = "; ".join(ties.remarks) or "none of the surveyed points can be placed"
+        return f"Where the model lies in the world is unknown: {why}."
+    if level == "pass" and found is not None:
+        return f"Check points, which took no part in the estimation: {found.text}."
+    first = objections[0]
+    start = (
+        "The model does not lie where surveyed points are."
+        if level == "fail"
+        else "The position may be correct, but nothing independent proves it."
+        if first.check == "independent"
+        else "The position is not proven to the precision of the photos."
+    )
+    return f"{start} {first.place[0].upper()}{first.place[1:]}: {first.found}."

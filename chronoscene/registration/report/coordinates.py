@@ -1,0 +1,159 @@
+"""Cameras, points and control of a registration as tables, in a reference system.
+
+The scene itself stays in its local frame: it is small enough for float32, and its shapes are not
+distorted by a map projection. Here every position is converted by itself, in float64.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from chronoscene.arrays import Array
+from chronoscene.geodesy import Georeference, ReferenceSystem
+from chronoscene.io.staging import replacing, write_text_atomic
+from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.residuals import PointResidual
+from chronoscene.scene.geometry import camera_centre
+
+GEOREFERENCE = "georeference.json"
+CAMERAS = "cameras.csv"
+POINTS = "points.ply"
+CONTROL = "control.csv"
+
+DECIMALS = 4
+"""Decimals of coordinates in metres: a tenth of a millimetre."""
+
+
+def write_coordinates(folder: Path, model: Registered, output: ReferenceSystem | None) -> None:
+    """Write ``georeference.json`` and, in a reference system, ``cameras.csv`` and ``points.ply``.
+
+    Args:
+        folder: An existing folder.
+        model: Nothing is written if it is not georeferenced.
+        output: Projected reference system.
+    """
+    frame = model.georeference
+    if frame is None:
+        return
+    record = asdict(frame) | {"crs": frame.crs}
+    if output is not None:
+        record["output"] = _linear(model, frame, output)
+        _write_cameras(folder / CAMERAS, model, frame, output)
+        _write_points(folder / POINTS, model, frame, output)
+    write_text_atomic(folder / GEOREFERENCE, json.dumps(record, indent=1) + "\n")
+
+
+def _linear(model: Registered, frame: Georeference, output: ReferenceSystem) -> dict[str, Any]:
+    """Linear approximation of the reference system around the middle of the cameras.
+
+    Coordinates are ``offset + matrix @ world``, up to ``largest_error`` metres at any camera or
+    point of the model.
+    """
+    centres = camera_centre(model.cam_from_world)
+    middle = np.median(centres, axis=0)[None]
+    matrix = output.derivative(frame, middle)[0]
+    offset = (output.from_local(frame, middle) - middle @ matrix.T)[0]
+    places = np.concatenate([centres, model.points])
+    error = output.from_local(frame, places) - places @ matrix.T - offset
+    return {
+        "crs": output.text,
+        "offset": offset.tolist(),
+        "matrix": matrix.tolist(),
+        "largest_error": float(np.linalg.norm(error, axis=1).max()),
+    }
+
+
+def _write_cameras(
+    path: Path, model: Registered, frame: Georeference, output: ReferenceSystem
+) -> None:
+    centres = camera_centre(model.cam_from_world)
+    places = output.from_local(frame, centres)
+    axes = output.derivative(frame, centres)
+    angles = omega_phi_kappa(model.cam_from_world[:, :3, :3], axes)
+    rows = zip(model.names, model.periods, places, angles, strict=True)
+    _write_table(
+        path,
+        ("image", "period", "E", "N", "h", "omega", "phi", "kappa"),
+        (
+            (name, model.labels[period], *_metres(place), *(f"{a:.6f}" for a in angle))
+            for name, period, place, angle in rows
+        ),
+    )
+
+
+def omega_phi_kappa(rotations: Array, axes: Array) -> Array:
+    """Photogrammetric angles of cameras, in degrees.
+
+    Rx(omega) Ry(phi) Rz(kappa) rotates the axes of the image (x right, y up, z backwards) to east,
+    north and up of the reference system. All are 0 for a photo straight down with its top north.
+
+    Args:
+        rotations: Of ``cam_from_world``. [N, 3, 3]
+        axes: Derivative of the coordinates by those of the world, at each camera. [N, 3, 3]
+
+    Returns:
+        [N, 3]
+    """
+    from scipy.spatial.transform import Rotation
+
+    u, _, vt = np.linalg.svd(axes)  # without scale and shear
+    turned = u @ vt @ np.swapaxes(rotations, 1, 2) @ np.diag([1.0, -1.0, -1.0])
+    return np.asarray(Rotation.from_matrix(turned).as_euler("XYZ", degrees=True), np.float64)
+
+
+def _write_points(
+    path: Path, model: Registered, frame: Georeference, output: ReferenceSystem
+) -> None:
+    """Write coordinates of 64 bits: those of 32 bits are exact to half a metre only."""
+    kinds = [(axis, "f8") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")]
+    rows = np.empty(len(model.points), kinds)
+    places = output.from_local(frame, model.points)
+    for i in range(3):
+        rows["xyz"[i]] = places[:, i]
+        rows[("red", "green", "blue")[i]] = model.colors[:, i]
+    data = PlyData([PlyElement.describe(rows, "vertex")], comments=[f"crs {output.text}"])
+    with replacing(path) as partial:
+        data.write(str(partial))
+
+
+def write_control(path: Path, points: Sequence[PointResidual]) -> None:
+    """Write the errors of all surveyed points."""
+    head = (
+        "point", "role", "used", "clicks", "periods", "E", "N", "h", "error_E", "error_N",
+        "error_h", "click_consistency_px", "note",
+    )  # fmt: skip
+    _write_table(
+        path,
+        head,
+        (
+            (
+                r.name, r.role, int(r.used), r.clicks, " ".join(r.periods),
+                *(_metres(r.surveyed) if r.surveyed else [""] * 3),
+                *(_metres(r.error) if r.error else [""] * 3),
+                "" if r.click_consistency is None else f"{r.click_consistency:.3f}", r.note,
+            )
+            for r in points
+            if r.role != "tie"
+        ),
+    )  # fmt: skip
+
+
+def _metres(values: Iterable[float]) -> list[str]:
+    return [f"{round(value, DECIMALS) + 0.0:.{DECIMALS}f}" for value in values]  # no -0.0000
+
+
+def _write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    write_text_atomic(path, text.getvalue())
