@@ -62,6 +62,6 @@ def decode(data: bytes) -> GaussianCloud:
         means=columns(0, 3),
         quats=columns(58, 62),
         scales=np.exp(columns(55, 58)),
-        opacities=1 / (1 + np.exp(-columns(54, 55)[:, 0])),
+        opacities=(1 / (1 + np.exp(-columns(54, 55)[:, 0]))).astype(np.float32),
         sh_coeffs=np.concatenate([columns(6, 9)[:, None], rest], axis=1),
     )

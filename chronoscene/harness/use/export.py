@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,7 +165,7 @@ def measure_loss(
     return ExportLoss(len(values), own, exported[-1], exported[0] if filtered else None)
 
 
-def _frames(scene: Scene, split: str, period: float) -> tuple[Frame, ...]:
+def _frames(scene: Scene, split: Literal["train", "test"], period: float) -> tuple[Frame, ...]:
     """Return the frames of a period; none in between periods."""
     return tuple(scene.select(split=split, period=int(period))) if period == int(period) else ()
 
