@@ -1,15 +1,15 @@
-"""Uncertainty by test views and seeds: intervals of means over views, and of differences.
+"""Uncertainty by test views: resampled means over views, and their intervals.
 
 Neighbouring views show much the same, so ten of one place say less than ten of different places.
-The interval over views is therefore a block bootstrap: stretches of the path are drawn with
+The means are therefore those of a block bootstrap: stretches of the path are drawn with
 replacement, in each period for itself. Equal views are drawn alike for all methods, so that
-differences of resampled means are paired.
+differences of resampled means are paired (`differences`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from zlib import crc32
 
@@ -21,6 +21,9 @@ from chronoscene.formats.shared.grouping import natural_key
 LEVEL = 0.95
 REPLICATES = 2000
 SEED = 0
+CORRELATION = 0.3
+"""Correlation of neighbouring views for which variances are without bias. Where it is smaller, they
+are too large."""
 
 
 def block_length(n: int) -> int:
@@ -58,46 +61,69 @@ def resampled_means(values: Mapping[str, float], stratum: str) -> NDArray[np.flo
 def resampling_weights(n: int, stream: int) -> NDArray[np.float64]:
     """Compute the weights of views in resampled means of a path; those of a mean add up to 1.
 
-    Circular blocks (Politis & Romano 1992) of L_1 to L_k views, n together. For independent views
-    the variance of such means is the wanted one times 1 - sum L_i^2 / n^2, which the weights make
-    up for; with blocks of one view that is the usual factor n / (n - 1).
+    Circular blocks (Politis & Romano 1992) of `block_length` views, n together. Such means vary too
+    little: blocks are drawn around the mean of the few that there are, and neighbours in different
+    blocks are drawn apart. The weights make up for both, if the correlation of views falls as
+    `CORRELATION` to the power of their distance on the path.
 
     Returns:
         [REPLICATES, n]
     """
     length = block_length(n)
-    lengths = np.full(-(-n // length), length)
-    lengths[-1] -= lengths.sum() - n
-    starts = np.random.default_rng([SEED, stream]).integers(n, size=(REPLICATES, len(lengths), 1))
+    blocks = -(-n // length)
+    starts = np.random.default_rng([SEED, stream]).integers(n, size=(REPLICATES, blocks, 1))
     drawn = ((starts + np.arange(length)) % n).reshape(REPLICATES, -1)[:, :n]
     places = drawn + n * np.arange(REPLICATES)[:, None]
     shares = np.bincount(places.ravel(), minlength=REPLICATES * n).reshape(REPLICATES, n) / n
-    return (shares - 1 / n) / math.sqrt(1 - (lengths**2).sum() / n**2) + 1 / n
+    alike = _correlations(n)
+    found = (np.cov(shares.T) * alike).sum()
+    return (shares - 1 / n) * math.sqrt(alike.mean() / found) + 1 / n
 
 
-def interval(resampled: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute the ends of percentile intervals. [..., REPLICATES] to [...] each"""
-    low, high = np.quantile(resampled, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=-1)
-    return low, high
+def _correlations(n: int) -> NDArray[np.float64]:
+    """Return the correlations of the views of a path that weights make up for. [n, n]"""
+    return CORRELATION ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
 
 
-def seed_margin(sds: ArrayLike, ns: ArrayLike, sd: float, n: int) -> NDArray[np.float64]:
-    """Compute differences between means over seeds that chance explains, by Welch's t-test.
+@lru_cache
+def degrees_of_freedom(n: int) -> float:
+    """Compute those of the variance of resampled means of n views; NaN for a single view.
+
+    The variance is x^T A x of the values x, with the covariance A of the weights. For normal values
+    with covariance S it is spread as a chi-squared with tr(A S)^2 / tr(A S A S) of them.
+    """
+    if n < 2:
+        return math.nan
+    product = np.cov(resampling_weights(n, 0).T) @ _correlations(n)
+    return float(np.trace(product) ** 2 / np.trace(product @ product))
+
+
+def pooled_freedom(counts: Iterable[int]) -> float:
+    """Compute the degrees of freedom of a mean over periods with so many views each.
+
+    The formula is that of Satterthwaite (1946), for views that vary alike in all periods.
+    """
+    counts = [*counts]
+    total = sum(1 / n for n in counts)
+    spread = sum(1 / n**2 / degrees_of_freedom(n) for n in counts)
+    return total**2 / spread if counts else math.nan
+
+
+def interval(
+    resampled: NDArray[np.float64], freedom: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Compute the ends of percentile intervals, wider by what t has over the normal distribution.
 
     Args:
-        sds: Sample standard deviations of some methods. [M]
-        ns: How many seeds each of them has. [M]
-        sd: That of the method they are compared with.
-        n: How many seeds that one has.
+        resampled: Resampled means. [..., REPLICATES]
+        freedom: Degrees of freedom of their variance. [...]
 
     Returns:
-        NaN where a method has one seed, or nothing is spread. [M]
+        The two ends. [...] each
     """
-    from scipy.special import stdtrit
+    from scipy.special import ndtri, stdtrit
 
-    ns = np.asarray(ns)
-    variances, variance = np.square(sds) / ns, sd**2 / n
-    with np.errstate(invalid="ignore", divide="ignore"):
-        total = variances + variance
-        freedom = total**2 / (variances**2 / (ns - 1) + variance**2 / (n - 1))
-    return stdtrit(freedom, (1 + LEVEL) / 2) * np.sqrt(total)
+    middle = resampled.mean(axis=-1)
+    wider = stdtrit(freedom, (1 + LEVEL) / 2) / ndtri((1 + LEVEL) / 2)
+    low, high = np.quantile(resampled, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=-1)
+    return middle + (low - middle) * wider, middle + (high - middle) * wider

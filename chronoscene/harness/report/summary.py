@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,7 +18,19 @@ from chronoscene.arrays import Array
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.harness.files.records import Failure, RunRecord, read_failures, run_folders
 from chronoscene.harness.report.comparable import apart, each_once
-from chronoscene.harness.report.intervals import REPLICATES, interval, resampled_means, seed_margin
+from chronoscene.harness.report.differences import (
+    SeedSpread,
+    explained_by_seeds,
+    margins,
+    seed_spread,
+)
+from chronoscene.harness.report.intervals import (
+    REPLICATES,
+    degrees_of_freedom,
+    interval,
+    pooled_freedom,
+    resampled_means,
+)
 from chronoscene.harness.score.regions import ALL
 from chronoscene.harness.score.scoring import read_scored
 from chronoscene.metrics.registry import all_metrics, metric_info
@@ -121,7 +135,8 @@ SHARING = (
 ENTRY_COLUMNS = (
     *("source", "scene", "method", "strategy", "preset", "variant", "config_hash"),
     *("quantity", "column", "mean", "sd", "n", "low", "high"),
-    *("difference", "difference_low", "difference_high", "tied", "seeds", "device", "commit"),
+    *("difference", "difference_low", "difference_high", "by_seeds", "tied"),
+    *("seeds", "device", "commit"),
 )
 """Columns of CSV and JSON.
 
@@ -130,9 +145,13 @@ ENTRY_COLUMNS = (
 runs in stages have ``<stage>: period <id>`` and `TRANSFERS`, too. ``sd`` is the sample standard
 deviation over ``n`` seeds, empty for one seed; ``low`` and ``high`` are the ends of the 95 %
 interval over views. ``difference`` is that to the best mean of the same scene, quantity and
-column, with its interval over the same views; ``tied`` is True if views or seeds do not separate
-the two.
+column, with its 95 % interval by views and seeds (`differences`), which for single seeds is by
+views alone; seeds alone explain a difference of ``by_seeds``, empty if they are single. ``tied`` is
+True if the interval contains 0.
 """
+
+
+DIFFERENCE = ("difference", "difference_low", "difference_high", "by_seeds")
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
@@ -264,13 +283,14 @@ def with_spread(quantity: str, value: float, sd: float | None) -> str:
 def compared(entries: DataFrame) -> DataFrame:
     """Add intervals to entries, and a comparison with the best to those of metrics.
 
-    Adds ``low``, ``high``, ``difference``, ``difference_low``, ``difference_high`` and ``tied``, as
-    `ENTRY_COLUMNS` says, and ``rank``: 1 to `MARKED` where a table marks the entry, else 0. Values
-    that are printed alike have the same rank, and the last of several is never marked.
+    Adds ``low``, ``high``, ``tied`` and `DIFFERENCE`, as `ENTRY_COLUMNS` says, and ``rank``: 1 to
+    `MARKED` where a table marks the entry, else 0. Values that are printed alike have the same
+    rank, and the last of several is never marked.
     """
-    low, high = interval(np.reshape([*entries.resampled], (-1, REPLICATES)))
+    freedom = [*map(_freedom, entries.column, entries.views)]
+    low, high = interval(np.reshape([*entries.resampled], (-1, REPLICATES)), freedom)
     entries = entries.assign(low=low, high=high, tied=False, rank=0)
-    entries[["difference", "difference_low", "difference_high"]] = math.nan
+    entries[[*DIFFERENCE]] = math.nan
     measured = entries[entries.quantity.isin(all_metrics()) & (entries.source == MEASURED)]
     measured = measured[~measured.column.isin(TRANSFERS)]
     for (_, quantity, _), part in measured.groupby(["scene", "quantity", "column"], sort=False):
@@ -279,23 +299,55 @@ def compared(entries: DataFrame) -> DataFrame:
         entries.loc[ranks.index[ranks <= min(MARKED, len(part) - 1)], "rank"] = ranks.astype(int)
         best, *others = part.sort_values("mean", ascending=ascending, kind="stable").index
         if others:
-            compare_with(entries, best, others)
+            compare_with(entries, best, others, chosen=True)
     return entries
 
 
-def compare_with(entries: DataFrame, reference: Any, others: Sequence[Any]) -> None:
-    """Fill in the comparison of some entries with another one, all named by their index."""
+def compare_with(
+    entries: DataFrame, reference: Any, others: Sequence[Any], *, chosen: bool
+) -> None:
+    """Fill in the comparison of some entries with another one, all named by their index.
+
+    ``chosen``: The reference is the best of all of them, not one that was named beforehand. Entries
+    with other views are not paired with it: they have no interval, and seeds alone may tie them.
+    """
     first, rest = entries.loc[reference], entries.loc[others]
-    difference = rest["mean"] - first["mean"]
-    gaps = np.stack(rest.resampled) - first.resampled
-    gaps[[views != first.views for views in rest.views]] = math.nan  # not paired
-    low, high = interval(gaps)
-    by_seeds = np.abs(difference) <= seed_margin(rest.sd, rest.n, first.sd, first.n)
-    tied = ((low <= 0) & (high >= 0)) | by_seeds
-    entries.loc[others, "difference"] = difference
-    entries.loc[others, "difference_low"] = low
-    entries.loc[others, "difference_high"] = high
-    entries.loc[others, "tied"] = tied
+    difference = (rest["mean"] - first["mean"]).to_numpy()
+    resampled = np.stack([first.resampled, *rest.resampled])
+    known = np.array([views == first.views for views in rest.views])
+    known &= np.isfinite(resampled[1:, 0]) & np.isfinite(resampled[0, 0])
+    ns = np.array([first.n, *rest.n])
+    spread = seed_spread([first.sd, *rest.sd], ns)
+    by_seeds = explained_by_seeds(spread, ns)
+    margin = np.full(len(rest), math.nan)
+    if known.any():
+        family = np.append(True, known)
+        margin[known] = margins(
+            np.array([first["mean"], *rest["mean"]])[family],
+            resampled[family],
+            _freedom(first.column, first.views),
+            SeedSpread(spread.variances[family], spread.freedom),
+            ns[family],
+            chosen=chosen,
+        )
+    entries.loc[others, [*DIFFERENCE]] = np.stack(
+        [difference, difference - margin, difference + margin, by_seeds], axis=1
+    )
+    entries.loc[others, "tied"] = np.abs(difference) <= np.where(known, margin, by_seeds)
+
+
+@lru_cache
+def _freedom(column: str, views: frozenset[tuple[str, int, str]]) -> float:
+    """Return the degrees of freedom of the variance of a column by views; NaN without views.
+
+    ``views``: scene, period and name of each.
+    """
+    counts = Counter((scene, period) for scene, period, _ in views)
+    if column in ("macro", "micro"):
+        return pooled_freedom(counts.values())
+    # A period, or an aggregate that is mostly one period
+    of_one = [n for (_, i), n in counts.items() if column == f"period {i}"] or [*counts.values()]
+    return min(map(degrees_of_freedom, of_one), default=math.nan)
 
 
 def over_scenes(entries: DataFrame, name: str) -> DataFrame:

@@ -415,10 +415,19 @@ def footnotes(
     if entries.low.notna().any():
         notes.append(
             "[ ]: 95 % interval of macro over test views, by a bootstrap of blocks of neighbours "
-            "in each period; seeds are averaged before, so their spread is not in it"
+            "in each period; seeds are averaged before"
+        )
+    if entries.difference_low.notna().any():
+        notes.append(
+            "[ ] of a difference: over test views and seeds, whose spread is pooled over methods"
+            if entries.by_seeds.notna().any()
+            else "[ ] of a difference: over test views; with one seed, the spread of seeds is "
+            "unknown and not in it"
         )
     if entries.tied.any():
-        notes.append("†: at 95 %, views or seeds do not separate it from the best of its column")
+        notes.append(
+            "†: at 95 %, not separated from the best of its column, which was chosen among all"
+        )
     for name, title in (("device", "device"), ("commit", "code")):
         values = dict.fromkeys(str(getattr(run, name)) for run in records)
         if values:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from chronoscene.harness.files.records import Failure, RunRecord
 from chronoscene.harness.report.comparable import apart
 from chronoscene.harness.report.summary import (
+    DIFFERENCE,
     ENTRY_COLUMNS,
     MEASURED,
     PAPER_METRICS,
@@ -57,7 +58,7 @@ def study_entries(study: Study, runs: Mapping[str, Sequence[RunRecord]]) -> Data
     for _, part in measured.groupby(["scene", "quantity"], sort=False):
         reference, others = part.index[part.row == first], part.index[part.row != first]
         if len(reference) and len(others):
-            compare_with(measured, reference[0], others)
+            compare_with(measured, reference[0], others, chosen=False)
     return pd.concat([measured, _published(study)], ignore_index=True)
 
 
@@ -80,7 +81,7 @@ def _published(study: Study) -> DataFrame:
         for quantity, value in figures.items()
     ]
     columns = ("row", "scene", "quantity", "column", "mean", "difference")
-    unknown = dict.fromkeys(("sd", "low", "high", "difference_low", "difference_high"), math.nan)
+    unknown = dict.fromkeys(("sd", "low", "high", *DIFFERENCE[1:]), math.nan)
     texts = ("method", "strategy", "preset", "variant", "config_hash", "seeds", "device", "commit")
     return pd.DataFrame(entries, columns=columns).assign(
         source=study.source, n=1, tied=False, **unknown, **dict.fromkeys(texts, "")
@@ -185,10 +186,11 @@ def direction(entry: Mapping[Any, Any], published: Sequence[float]) -> str:
         return f"{UNDECIDED} (the published scenes do not agree)"
     if math.isnan(low):
         return f"{UNDECIDED} (there is no interval)"
+    if abs(entry["difference"]) <= entry["by_seeds"]:
+        explained = in_unit(entry["quantity"], entry["by_seeds"])
+        return f"{UNDECIDED} (seeds alone explain differences up to {explained})"
     if low <= 0 <= high:
         return f"{UNDECIDED} (the interval contains 0)"
-    if entry["tied"]:
-        return f"{UNDECIDED} (the seeds differ as much)"
     return AGREES if (entry["difference"] > 0) == (published[0] > 0) else DISAGREES
 
 
@@ -215,8 +217,8 @@ def study_texts(
     entries = study_entries(study, runs)
     table, sentences = study_table(study, entries), directions(study, entries)
     notes = [
-        f"difference: to {study.rows[0].label!r}, with its 95 % interval over the same test views; "
-        "for published figures in parentheses",
+        f"difference: to {study.rows[0].label!r}, with its 95 % interval; for published figures in "
+        "parentheses",
         *([f"published: {study.source}"] if study.source else []),
         *study.notes,
     ]

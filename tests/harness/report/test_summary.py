@@ -5,10 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_runs import record, scored, smooth
+from scipy.special import stdtrit
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files.records import ViewScore
-from chronoscene.harness.report.intervals import interval, resampled_means
+from chronoscene.harness.report.intervals import (
+    degrees_of_freedom,
+    interval,
+    pooled_freedom,
+    resampled_means,
+)
 from chronoscene.harness.report.published import load_published
 from chronoscene.harness.report.summary import (
     in_unit,
@@ -90,7 +96,8 @@ def test_periods_are_resampled_apart_and_seeds_are_averaged():
     expected = {"macro": np.mean(drawn, axis=0), "micro": np.mean(drawn, axis=0)}
     expected |= {f"period {i}": means for i, means in enumerate(drawn)}
     for column, means in expected.items():
-        assert (found.low[column], found.high[column]) == pytest.approx(interval(means))
+        freedom = degrees_of_freedom(9) if column.startswith("period") else pooled_freedom([9, 9])
+        assert (found.low[column], found.high[column]) == pytest.approx(interval(means, freedom))
     assert found.low["worst"] < found["mean"]["worst"] < found.high["worst"]
     assert found["mean"]["best"] == pytest.approx(max(mean.mean(axis=1)))
     assert found["mean"]["median of periods"] == pytest.approx(mean.mean())
@@ -121,8 +128,32 @@ def test_what_seeds_do_not_tell_apart_is_tied():
     shifts = {"a": (0.0, 2.0), "b": (-1.0, 1.0), "c": (-29.0, -29.0)}
     runs = [scored(m, i, psnr=VIEWS + s[i]) for m, s in shifts.items() for i in range(2)]
     found = macro(runs)
-    assert found["b"].difference_high < 0  # the views alone would tell them apart
+    assert not macro(runs[::2])["b"].tied  # views alone tell them apart
     assert found["b"].tied and not found["c"].tied
+    # Pooled variance (2 + 2 + 0) / 3, but 2 of their own; t of 3 degrees of freedom
+    assert found["b"].by_seeds == pytest.approx(3.1824463 * 2**0.5)
+    assert found["c"].by_seeds == pytest.approx(3.1824463 * (2 / 2 + 4 / 3 / 2) ** 0.5)
+
+
+def test_a_second_seed_does_not_tie_what_the_first_told_apart():
+    rng = np.random.default_rng(3)
+    means = dict(zip("abcdefgh", 0.5 * np.arange(8), strict=True))
+    runs = [
+        scored(m, seed, psnr=VIEWS - mean + 0.1 * rng.normal() + 0.2 * rng.normal(size=(2, 9)))
+        for seed in range(2)
+        for m, mean in means.items()
+    ]
+    for some in (runs[:8], runs):
+        assert [m for m, entry in macro(some).items() if entry.tied] == []
+    assert np.isnan(macro(runs[:8])["b"].by_seeds)
+
+
+def test_seeds_alone_tie_what_has_no_views():
+    runs = [record(m, i, psnr=(p + i,)) for m, p in (("a", 20.0), ("b", 19.0)) for i in range(2)]
+    (b,) = (entry for entry in macro(runs).values() if entry.method == "b")
+    assert (
+        b.tied and np.isnan(b.difference_low) and b.by_seeds == pytest.approx(4.3026527 * 0.5**0.5)
+    )
 
 
 def test_other_views_are_not_paired():
@@ -176,7 +207,10 @@ def test_scenes_are_averaged_with_their_intervals_and_spreads():
     assert mean.mean == pytest.approx(VIEWS.mean() + 3.5 / 2)
     assert mean.sd == pytest.approx(5 / 2**0.5 / 2)  # of the mean of two: hypot(3, 4) / sqrt(2) / 2
     lows = entries.query("column == 'macro' and method == 'chronogs'").eval("mean - low")
-    assert (mean.mean - mean.low) == pytest.approx(lows.mean() / 2**0.5, rel=0.1)
+    # Twice as many views estimate the variance: the quantile of t is smaller, too.
+    smaller = stdtrit(pooled_freedom([9] * 4), 0.975) / stdtrit(pooled_freedom([9] * 2), 0.975)
+    expected = lows.mean() / 2**0.5 * smaller
+    assert (mean.mean - mean.low) == pytest.approx(expected, rel=0.1)
     means = {cost.quantity: cost.mean for cost in costs}
     assert (means["checkpoint_bytes"], means["seconds"]) == (1_234_000, 10.0)
 

@@ -79,21 +79,37 @@ def test_a_row_without_a_result_has_no_direction(runs):
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "tied", "published", "expected"),
+    ("low", "high", "by_seeds", "published", "expected"),
     [
-        (-0.2, -0.1, False, (-1.0, -0.1), "agrees with the published one"),
-        (0.1, 0.2, False, (1.0,), "agrees with the published one"),
-        (0.1, 0.2, False, (-1.0,), "disagrees with the published one"),
-        (-0.1, 0.2, True, (-1.0,), "cannot be determined (the interval contains 0)"),
-        (0.1, 0.2, True, (-1.0,), "cannot be determined (the seeds differ as much)"),
-        (math.nan, math.nan, False, (-1.0,), "cannot be determined (there is no interval)"),
-        (0.1, 0.2, False, (-1.0, 1.0), "cannot be determined (the published scenes do not agree)"),
-        (0.1, 0.2, False, (0.0,), "cannot be determined (the published scenes do not agree)"),
+        (-0.2, -0.1, math.nan, (-1.0, -0.1), "agrees with the published one"),
+        (0.1, 0.2, 0.1, (1.0,), "agrees with the published one"),
+        (0.1, 0.2, 0.1, (-1.0,), "disagrees with the published one"),
+        (-0.1, 0.2, 0.01, (-1.0,), "cannot be determined (the interval contains 0)"),
+        (
+            *(-0.1, 0.2, 0.0621, (-1.0,)),
+            "cannot be determined (seeds alone explain differences up to 0.06)",
+        ),
+        (math.nan, math.nan, 0.0, (-1.0,), "cannot be determined (there is no interval)"),
+        (0.1, 0.2, 0.0, (-1.0, 1.0), "cannot be determined (the published scenes do not agree)"),
+        (0.1, 0.2, 0.0, (0.0,), "cannot be determined (the published scenes do not agree)"),
     ],
 )
-def test_direction_of_a_difference(low, high, tied, published, expected):
-    entry = {"difference_low": low, "difference_high": high, "tied": tied}
-    assert direction(entry | {"difference": (low + high) / 2}, published) == expected
+def test_direction_of_a_difference(low, high, by_seeds, published, expected):
+    entry = {"difference_low": low, "difference_high": high, "by_seeds": by_seeds}
+    entry |= {"difference": (low + high) / 2, "quantity": "psnr"}
+    assert direction(entry, published) == expected
+
+
+def test_two_seeds_that_differ_by_a_fifth_of_the_effect_decide():
+    rows = {"full": (0, 0.2), "without a": (-1, -1.2)}
+    runs = {label: [made(s, i) for i, s in enumerate(row)] for label, row in rows.items()}
+    for run in (run for of_row in runs.values() for run in of_row):
+        run.config_hash = f"seeds of {run.variant[:7]}"
+    runs |= {label: [] for label in ("without b", "without c", "twice d")}
+    study = STUDY.model_copy(update={"rows": STUDY.rows[:2]})
+    assert directions(study, study_entries(study, runs)) == [
+        "plaza, without a: in PSNR [dB] the direction agrees with the published one."
+    ]
 
 
 def test_every_format_has_measured_and_published_figures(runs, tmp_path):
