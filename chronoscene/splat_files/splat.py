@@ -36,12 +36,12 @@ def encode(cloud: GaussianCloud) -> bytes:
 def decode(data: bytes) -> GaussianCloud:
     """Read what `encode` made."""
     records = np.frombuffer(data, RECORD)
-    rgba = records["rgba"].astype(np.float32) / 255
+    rgba = records["rgba"].astype(np.float32) / np.float32(255)
     sh_coeffs = np.zeros((len(records), 16, 3), np.float32)
     sh_coeffs[:, 0] = (rgba[:, :3] - 0.5) / C0
     return GaussianCloud(
         means=records["mean"],
-        quats=(records["quat"] - np.float32(128)) / 128,
+        quats=(records["quat"].astype(np.float32) - np.float32(128)) / np.float32(128),
         scales=records["scale"],
         opacities=rgba[:, 3],
         sh_coeffs=sh_coeffs,

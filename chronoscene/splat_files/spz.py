@@ -85,7 +85,7 @@ def decode(data: bytes) -> GaussianCloud:
         means=means.astype(np.float32),
         quats=_unpack_rotations(np.ascontiguousarray(rotations).view("<u4")[:, 0]),
         scales=np.exp(scales / np.float32(16) - 10),
-        opacities=opacities[:, 0] / np.float32(255),
+        opacities=opacities[:, 0].astype(np.float32) / np.float32(255),
         sh_coeffs=np.concatenate([dc[:, None], rest], axis=1),
     )
 
