@@ -27,7 +27,7 @@ LAYERS = (
     ("chronoscene.training",),
     ("chronoscene.rasterizer", "chronoscene.metrics"),
     ("chronoscene.convert", "chronoscene.undistort"),
-    ("chronoscene.methods", "chronoscene.formats"),
+    ("chronoscene.methods", "chronoscene.formats", "chronoscene.splat_files"),
     ("chronoscene.images",),
     ("chronoscene.colmap",),
     ("chronoscene.scene",),

@@ -1,0 +1,1 @@
+"""Gaussians in the files that other programs open: a `GaussianCloud` in, bytes out, and back."""
