@@ -30,7 +30,10 @@ demo: $(DEMO)/.made
 	$(BIN)/chronoscene stats $(SCENE)
 	$(BIN)/chronoscene bench $(SCENE) --method $(DEMO_METHODS) \
 		--budget $(DEMO_BUDGET) --out $(DEMO)/runs
+	rm -rf $(DEMO)/page
+	$(BIN)/chronoscene page $(DEMO)/runs/demo/chronogs-*/seed0 --out $(DEMO)/page
 	@echo "The scene is in $(SCENE); tables, figures and predictions are in $(DEMO)/runs."
+	@echo "To walk through it, open $(DEMO)/page/index.html in a browser."
 
 # The mark stands beside the scene: nothing is ever written into a dataset folder. A scene without
 # its mark is what an interrupted run left behind.

@@ -28,6 +28,7 @@ COMMANDS = {
     "leaderboard": "chronoscene.cli.report.leaderboard:leaderboard_command",
     "methods": "chronoscene.cli.methods.methods:command",
     "new-method": "chronoscene.cli.methods.check_method:new",
+    "page": "chronoscene.cli.runs.page:command",
     "register": "chronoscene.cli.scenes.register:command",
     "render": "chronoscene.cli.runs.render:command",
     "score": "chronoscene.cli.report.results:score",

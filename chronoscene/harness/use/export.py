@@ -20,6 +20,7 @@ from chronoscene.scene import Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.orbit import find_up
+from chronoscene.scene.similarity import Sim3
 
 LIMIT_DB = 0.3
 """PSNR that plain viewers may lose on the training views, for them to be the default."""
@@ -84,7 +85,8 @@ def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = 
             todo="leave it out",
         )
     offset = local_offset(scene)
-    cloud = run.gaussians(period, scene=scene, offset=offset)
+    local_from_world = Sim3(1.0, np.eye(3), -offset)
+    cloud = run.gaussians(period, scene=scene, target_from_world=local_from_world)
     if not len(cloud):
         raise ConfigError(
             f"period {period:g}",

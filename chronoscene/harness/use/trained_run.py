@@ -235,7 +235,7 @@ class TrainedRun:
             )
 
     def gaussians(
-        self, period: float, *, scene: Scene | None = None, offset: ArrayLike = (0.0, 0.0, 0.0)
+        self, period: float, *, scene: Scene | None = None, target_from_world: Sim3 | None = None
     ) -> GaussianCloud:
         """Return the model of a period as Gaussians in the world frame of the scene.
 
@@ -245,11 +245,11 @@ class TrainedRun:
         Args:
             period: As for `render`.
             scene: The scene of the run, if it has been read already.
-            offset: Subtracted from the positions before they are rounded to float32, which holds
-                coordinates in the millions to half a unit only. [3]
+            target_from_world: Frame with axes parallel to the world's in which to return them, for
+                worlds whose coordinates float32 cannot hold.
 
         Returns:
-            float32 arrays; positions and sizes in world units.
+            float32 arrays; positions and sizes in units of the frame.
 
         Raises:
             ConfigError: If the period is not one of the run, or the method has no Gaussians.
@@ -270,7 +270,10 @@ class TrainedRun:
         frames = scene.select(split="train", period=own)
         views = self.frame_views(scene, (f for f in frames if f.period < self.num_periods))
         gaussians = model.to_gaussians(self.model_period(period), views)
-        return gaussians.transformed(self.training_from_local(offset).inverse())
+        world_from_training = self.training_from_world.inverse()
+        if target_from_world is None:
+            return gaussians.transformed(world_from_training)
+        return gaussians.transformed(target_from_world @ world_from_training)
 
     def training_from_local(self, offset: ArrayLike) -> Sim3:
         """Return the transform into the training frame from the world minus an offset [3]."""
