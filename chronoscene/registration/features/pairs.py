@@ -33,8 +33,8 @@ POSED_NEIGHBOURS, POSED_CANDIDATES = 12, 60
 """Neighbours of an image with a known pose in every period, and the nearest they are chosen of."""
 
 LEAST_COSINE = 0.25
-"""Cosine of the angle between the directions of view of neighbours: 75 degrees. SIFT features are lost
-long before."""
+"""Cosine of the angle between the directions of view of neighbours: 75 degrees. SIFT features are
+lost long before."""
 
 WORDS = 64
 MAX_TRAINING = 20_000
