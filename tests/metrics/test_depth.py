@@ -34,5 +34,7 @@ def test_the_mask_decides():
     depth = np.where(mask, 3.0, 9.0)
     expected = {"depth_abs_rel": 0, "depth_rmse": 0, "depth_delta": 1}
     assert depth_errors(depth, truth, mask) == expected
+    sky = np.where([[False, True], [False, False]], 0.0, truth)
+    assert depth_errors(depth, sky, mask | (sky == 0)) == expected
     with pytest.raises(ShapeError, match="at least one pixel"):
         depth_errors(depth, 0 * truth)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.training.schedules import log_linear
+from chronoscene.training.schedules import cooled, log_linear
 
 POSITIVE = st.floats(1e-8, 1e3)
 
@@ -36,3 +36,9 @@ def test_off_stays_off_and_a_zero_end_is_refused():
     assert log_linear(0.3, 0.0, 0.0) == 0.0
     with pytest.raises(ValueError, match="positive"):
         log_linear(0.3, 1.0, 0.0)
+
+
+def test_a_cooldown_takes_the_last_part_down_to_a_tenth():
+    found = [cooled({"means": 2.0}, progress, 0.25)["means"] for progress in (0, 0.75, 0.875, 1)]
+    assert found == pytest.approx([2.0, 2.0, 2.0 * 10**-0.5, 0.2])
+    assert cooled({"means": 2.0}, 1.0, 0.0) == {"means": 2.0}

@@ -34,6 +34,12 @@ def test_forgetting_and_transfers_by_hand():
     assert found["forward_transfer"]["psnr"] == pytest.approx(((18 - 8) + (15 - 9)) / 2)
 
 
+def test_what_was_shown_of_a_period_before_its_stage_cannot_be_forgotten():
+    early = {"0": STAGES["period-0"]["0"], "1": {"psnr": 29.0, "lpips_vgg": 0.05}}
+    expected = transfer(STAGES)["forgetting"]
+    assert transfer(STAGES | {"period-0": early})["forgetting"] == expected
+
+
 def test_where_less_is_better_the_signs_say_the_same():
     found = transfer(STAGES)
     assert found["forgetting"]["lpips_vgg"] == pytest.approx(((0.4 - 0.1) + 0) / 2)
