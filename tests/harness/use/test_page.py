@@ -23,11 +23,11 @@ from chronoscene.scene.similarity import Sim3
 from chronoscene.splat_files.spz import decode, encode
 
 LEAST_PSNR_STORED = 55.0
-"""In dB, of the page against our rasterizer, for the Gaussians in the steps of SPZ. Measured: 60.6 to
-62.9 in the three test views."""
+"""In dB, of the page against our rasterizer, for the Gaussians in the steps of SPZ. Measured: 60.6
+to 62.9 in the three test views."""
 LEAST_PSNR = 36.0
-"""The same for Gaussians as they are. Measured: 37.9 to 42.1; six anchors make a rough picture. On 14
-test views of the demo scene 45.4 to 48.4."""
+"""The same for Gaussians as they are. Measured: 37.9 to 42.1; six anchors make a rough picture. On
+14 test views of the demo scene 45.4 to 48.4."""
 
 
 def make_page(folders, out, *options):
