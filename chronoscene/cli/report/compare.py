@@ -21,9 +21,9 @@ from chronoscene.cli.output import (
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.ground_truth import truth_of
-from chronoscene.harness.report.between_figure import between_csv, between_table, draw_between
-from chronoscene.harness.report.comparison_figure import by_scene, chosen_views, draw_figures
 from chronoscene.harness.report.comparison_page import comparison_page
+from chronoscene.harness.report.figures.between import between_csv, between_table, draw_between
+from chronoscene.harness.report.figures.comparison import by_scene, chosen_views, draw_figures
 from chronoscene.harness.report.single_views import view_scores, worst_views
 from chronoscene.harness.report.summary import kind_of, read_runs
 from chronoscene.harness.use.between import measure_between, parse_dates

@@ -12,10 +12,10 @@ from chronoscene.cli.output import FORMAT, OUT_FILE, emit, say, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RESULTS_FILE, ROWS_FILE
-from chronoscene.harness.report.comparison_figure import draw_figures
+from chronoscene.harness.report.figures.comparison import draw_figures
+from chronoscene.harness.report.figures.sharing import draw_sharing
+from chronoscene.harness.report.figures.stage import draw_stages
 from chronoscene.harness.report.published import load_published
-from chronoscene.harness.report.sharing_figure import draw_sharing
-from chronoscene.harness.report.stage_figure import draw_stages
 from chronoscene.harness.report.summary import in_region, read_runs
 from chronoscene.harness.report.tables import MAX_PERIODS, format_runs
 from chronoscene.harness.score.regions import ALL, REGIONS, freeze_change_masks

@@ -13,7 +13,7 @@ from chronoscene import __version__
 from chronoscene.harness.files.ground_truth import truth_of
 from chronoscene.harness.files.predictions import ImageEntry, load_image, load_mask, read_manifest
 from chronoscene.harness.files.records import Failure, RunRecord
-from chronoscene.harness.report.comparison_figure import (
+from chronoscene.harness.report.figures.comparison import (
     ShownRun,
     by_scene,
     chosen_views,

@@ -14,7 +14,7 @@ from chronoscene.errors import ConfigError, DiskFullError, MetricUnavailableErro
 from chronoscene.harness.files import records
 from chronoscene.harness.files.predictions import read_manifest
 from chronoscene.harness.files.records import read_rows, read_run, run_folders
-from chronoscene.harness.report.comparison_figure import draw_figures
+from chronoscene.harness.report.figures.comparison import draw_figures
 from chronoscene.harness.report.summary import read_runs
 from chronoscene.harness.report.tables import format_runs
 from chronoscene.harness.run import runner

@@ -11,7 +11,7 @@ from typing import Any
 from chronoscene.figures import canvas
 from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.records import FIGURES
-from chronoscene.harness.report.comparison_figure import CELL_WIDTH
+from chronoscene.harness.report.figures.comparison import CELL_WIDTH
 from chronoscene.harness.report.tables import period_name
 from chronoscene.harness.score.between import FRACTIONS, Image, MethodBetween, SceneBetween
 from chronoscene.io.tables import Table, csv_text

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import ImageWriter, load_image, read_manifest
 from chronoscene.harness.files.records import read_run
-from chronoscene.harness.report.comparison_figure import (
+from chronoscene.harness.report.figures.comparison import (
     ShownRun,
     _draw_row,
     chosen_views,

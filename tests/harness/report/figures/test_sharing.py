@@ -4,7 +4,7 @@ from made_runs import record
 from matplotlib.figure import Figure
 
 from chronoscene.figures import canvas
-from chronoscene.harness.report.sharing_figure import draw_sharing
+from chronoscene.harness.report.figures.sharing import draw_sharing
 from chronoscene.methods import PeriodSharing
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image
 
-from chronoscene.harness.report.stage_figure import draw_stages
+from chronoscene.harness.report.figures.stage import draw_stages
 from chronoscene.harness.report.summary import read_runs
 
 

@@ -1,0 +1,1 @@
+"""Figures: predictions beside photos, between dates, after stages, and what periods share."""
