@@ -364,6 +364,18 @@ def test_gps_finds_offset_scale_and_turn() -> None:
     assert isinstance(fit_gps(centres, np.full_like(centres, np.nan)), str)
 
 
+@pytest.mark.parametrize("count", [100, 1600])
+def test_an_offset_of_gps_is_known_as_well_as_its_median(count: int) -> None:
+    rng = np.random.default_rng(1)
+    centres = rng.uniform(-80, 80, (count, 3))
+    offset = np.array([4.0, -3.0, 20.0])
+    found = fit_gps(centres, centres + offset + rng.normal(0, 2.0, centres.shape))
+    assert isinstance(found, PeriodGpsFit)
+    expected = 2.0 * np.sqrt(np.pi / 2 / count)
+    np.testing.assert_allclose(found.offset_error, expected, rtol=0.25)
+    assert np.abs(found.offset - offset).max() < 3 * expected
+
+
 def test_extent_of_cameras_that_stand_still(good: Registered) -> None:
     poses = good.cam_from_world.copy()
     poses[:, :3, 3] = -np.einsum("nij,j->ni", poses[:, :3, :3], [1.0, 2.0, 3.0])

@@ -52,6 +52,16 @@ def test_gps_with_gross_outliers() -> None:
     assert found.rms == pytest.approx(0.3 * np.sqrt(3), rel=0.3)
 
 
+def test_positions_beyond_four_median_residuals_do_not_count() -> None:
+    rng = np.random.default_rng(6)
+    world = circle(30)
+    enu = camera_centre(world) + rng.normal(0, 0.3, (30, 3))
+    enu[[3, 11]] += [0.0, 0.0, 3.0]  # six times the median
+    found = align_to_gps(world, enu)
+    assert found is not None
+    assert found.inliers.tolist() == [i not in (3, 11) for i in range(30)]
+
+
 def test_gps_noise_as_large_as_the_scene_is_of_no_use() -> None:
     rng = np.random.default_rng(7)
     world = circle(12, radius=2.0)

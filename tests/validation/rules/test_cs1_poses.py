@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation.folder.scene_folder import RawScene
 
 IMAGES = "sparse/0/images.txt"
 
@@ -58,6 +59,19 @@ def test_far_camera(scene):
 def test_camera_a_little_aside_is_silent(scene):
     scene.change_poses(lambda r, t: (r, t + np.array([0, 0, 50.0])), [3])
     assert "CS124" not in {f.code for f in scene.validate().findings}
+
+
+@pytest.mark.parametrize(("times", "far"), [(19.9, False), (20.1, True)])
+def test_far_is_twenty_times_the_usual_distance(scene, times, far):
+    scene.change_poses(lambda r, t: (r, t + np.array([0, 0, 500.0])), [3])
+    model = RawScene(scene.root)  # medians do not depend on how far
+    middle = np.median(model.centres, axis=0)
+    usual = np.percentile(np.linalg.norm(model.centres - middle, axis=1), 90)
+    usual = max(usual, np.median(np.linalg.norm(model.points.xyz - middle, axis=1)))
+    away = model.centres[3] - middle
+    place = middle + times * usual * away / np.linalg.norm(away)
+    scene.change_poses(lambda r, t: (r, -r @ place), [3])
+    assert ("CS124" in {f.code for f in scene.validate().findings}) == far
 
 
 def test_cameras_in_one_place_are_silent(scene):
