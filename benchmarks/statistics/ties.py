@@ -7,7 +7,7 @@ two halves is better by 1 dB, a truly best one is told from the best. "Power": t
 that are told from one that is truly better by so much. "Coverage": of the interval over views.
 
 The spreads are those of PSNR in leaderboard/entries/measured: differences between two methods have
-a standard deviation of 0.5 to 0.9 dB over the views of a period (medians of four scenes), 0.6 here.
+a standard deviation of 0.50 to 0.95 dB over views of a period (medians of four scenes), 0.6 here.
 Seeds: 0.15 dB, typical of docs/experiments/methods-compared.md; entries have single seeds.
 """
 
@@ -119,8 +119,8 @@ def coverage(cases: int, views: int, correlation: float) -> float:
 
 def show(title: str, heads: Iterable[object], rows: Iterable[Sequence[object]]) -> None:
     """Print a table in Markdown."""
-    heads = [*map(str, heads)]
-    print(f"\n{title}\n\n| {' | '.join(heads)} |\n|{' ---: |' * len(heads)}")
+    names = [*map(str, heads)]
+    print(f"\n{title}\n\n| {' | '.join(names)} |\n|{' ---: |' * len(names)}")
     for row in rows:
         cells = (f"{cell:.0f} %" if isinstance(cell, float) else str(cell) for cell in row)
         print(f"| {' | '.join(cells)} |")
