@@ -1,20 +1,22 @@
 """The PLY file of 3DGS, number by number."""
 
+import io
+
 import numpy as np
 from plyfile import PlyData
 
-from chronoscene.formats.shared.gaussian_ply import write_gaussians
 from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.splat_files.ply import encode
 
 
-def test_every_number_is_in_its_column(tmp_path):
+def test_every_number_is_in_its_column():
     rng = np.random.default_rng(0)
     means, scales = rng.normal(size=(5, 3)), rng.uniform(0.1, 2.0, (5, 3))
     quats, opacities = rng.normal(size=(5, 4)), np.array([0.0, 0.2, 0.5, 0.9, 1.0])
     sh_coeffs = rng.normal(size=(5, 16, 3))
     arrays = (means, quats, scales, opacities, sh_coeffs)
-    write_gaussians(tmp_path / "a.ply", GaussianCloud(*(a.astype(np.float32) for a in arrays)))
-    columns = PlyData.read(tmp_path / "a.ply")["vertex"]
+    data = encode(GaussianCloud(*(a.astype(np.float32) for a in arrays)))
+    columns = PlyData.read(io.BytesIO(data))["vertex"]
 
     def read(*names):
         return np.stack([columns[name] for name in names], axis=1)
