@@ -50,7 +50,6 @@ REFUSED = {
     ),
     "no points": all_points,
     "points in test images only": lambda scene: without_points(scene, TRAINING_IMAGES),
-    "points in no image": lambda scene: without_points(scene, range(1, 19)),
 }
 
 

@@ -15,6 +15,8 @@ from chronoscene.harness.files.predictions import load_image, read_manifest
 from chronoscene.harness.files.records import PREDICTIONS
 from chronoscene.harness.use.trained_run import open_run
 
+TOY = ("--plugin", "toy_methods:MEAN")
+
 
 def render(folder, out, *options):
     arguments = ["render", str(folder), "--out", str(out), *map(str, options)]
@@ -62,7 +64,7 @@ def test_methods_without_geometry_of_their_own_refuse_another_light(runs, traine
     message = "appearance of period 1: expected one model of all periods"
     for folder in (runs / "ring/mean-joint-balanced/seed0", trained["4dgs"]):
         with pytest.raises(ConfigError, match=message):
-            render(folder, tmp_path / "out", "--appearance-period", "autumn")
+            render(folder, tmp_path / "out", "--appearance-period", "autumn", *TOY)
 
 
 @pytest.mark.parametrize(
@@ -108,10 +110,10 @@ def test_a_run_without_a_model(runs, tmp_path):
     folder = runs / "ring/mean-separate-balanced/seed0"
     (folder / "checkpoint/period-1").rename(tmp_path / "elsewhere")
     with pytest.raises(CheckpointError, match="period-1: expected the model of the run"):
-        render(folder, tmp_path / "out")
+        render(folder, tmp_path / "out", *TOY)
     (folder / "checkpoint").rename(tmp_path / "checkpoint")
     with pytest.raises(CheckpointError, match="expected a run with a model"):
-        render(folder, tmp_path / "out")
+        render(folder, tmp_path / "out", *TOY)
 
 
 def test_no_space_leaves_nothing_behind(runs, tmp_path, monkeypatch):
@@ -121,5 +123,5 @@ def test_no_space_leaves_nothing_behind(runs, tmp_path, monkeypatch):
     monkeypatch.setattr("chronoscene.harness.use.rendering.encode_png", full)
     (tmp_path / "new").mkdir()
     with pytest.raises(DiskFullError, match="out: expected space"):
-        render(runs / "ring/mean-joint-balanced/seed0", tmp_path / "new" / "out")
+        render(runs / "ring/mean-joint-balanced/seed0", tmp_path / "new" / "out", *TOY)
     assert not list((tmp_path / "new").iterdir())
