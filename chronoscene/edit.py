@@ -56,6 +56,8 @@ class Edited:
 
     scene: Scene
     """The new scene."""
+    names: Mapping[str, str]
+    """Names of its images in the files of the new scene, by those that they had."""
     images_dropped: int
     images_outside: int
     """Images among them that see nothing in the box."""
@@ -108,10 +110,13 @@ def edit(
         SceneError: If ``out`` is in use, or an image is missing.
     """
     done = apply(scene, edits)
-    images = _renames(scene, edits.rename)[1]
-    names = {f.name: images.get(f.name, f.name) for f in done.scene.frames}
     write_renamed(
-        done.scene, out, names, texts=our_format.TEXTS, image_source=image_source, progress=progress
+        done.scene,
+        out,
+        done.names,
+        texts=our_format.TEXTS,
+        image_source=image_source,
+        progress=progress,
     )
     return replace(done, scene=our_format.read(out))
 
@@ -132,7 +137,7 @@ def apply(scene: Scene, edits: Edits) -> Edited:
         _check_left(seeing, "image", "--crop", "choose a larger box")
     points, unseen = _points_of(scene.points, inside, seeing)
     frames = tuple(f for f, stays in zip(scene.frames, seeing.tolist(), strict=True) if stays)
-    labels = _renames(scene, edits.rename)[0]
+    labels, images = _renames(scene, edits.rename)
     left = {f.period for f in frames}
     periods, number = _merged([p for p in scene.periods if p.id in left], labels)
     new = replace(
@@ -144,6 +149,7 @@ def apply(scene: Scene, edits: Edits) -> Edited:
     )
     return Edited(
         scene=new,
+        names={f.name: images.get(f.name, f.name) for f in frames},
         images_dropped=len(scene.frames) - len(frames),
         images_outside=int(np.count_nonzero(kept & ~seeing)),
         points_outside=int(np.count_nonzero(~inside)),

@@ -39,14 +39,14 @@ BY_SEEDS = 0.15
 
 @dataclass(frozen=True)
 class Case:
-    """What a table is drawn from."""
+    """Sizes, spreads and correlation that a table is drawn from."""
 
     methods: int
     views: int
     seeds: int
     correlation: float
     seed_sds: Sequence[float] | float = BY_SEEDS
-    """Of all methods, or of each."""
+    """Spread by seeds of all methods, or of each."""
 
 
 def draw(rng: np.random.Generator, case: Case, better: Floats) -> tuple[Floats, Floats]:

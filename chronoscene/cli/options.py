@@ -38,6 +38,10 @@ RUNS = click.argument("folders", metavar="RUNS...", nargs=-1, required=True, typ
 
 SCENES = click.argument("scenes", metavar="[DIR]...", nargs=-1, type=FOLDER)
 
+LINK = click.option(
+    "--link", type=click.Choice(["hard", "sym"]), help="Link the images instead of copying them."
+)
+
 LPIPS_WEIGHTS = click.option(
     "--lpips-weights",
     type=click.Path(path_type=Path, exists=True),

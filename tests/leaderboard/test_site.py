@@ -48,7 +48,7 @@ class Page(HTMLParser):
 
 
 def standings(folder, claimed=""):
-    """What stands in a folder of entries, as if it was verified, or claimed for a reason."""
+    """Read the entries of a folder as if they were verified, or claimed for a reason."""
     return [replace(standing, claimed=claimed) for standing in read_board(folder).standings]
 
 

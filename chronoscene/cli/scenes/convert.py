@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import PATH, reading_options
+from chronoscene.cli.options import LINK, PATH, reading_options
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, describe_period, show_note
@@ -27,9 +27,7 @@ from chronoscene.scene.splits import split_hash
     default="chronoscene",
     help="Format of OUT.",
 )
-@click.option(
-    "--link", type=click.Choice(["hard", "sym"]), help="Link the images instead of copying them."
-)
+@LINK
 def command(
     source: Path,
     out: Path,

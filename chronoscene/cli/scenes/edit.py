@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import PATH, parse_assignments, reading_options
+from chronoscene.cli.options import LINK, PATH, parse_assignments, reading_options
 from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, describe_period, show_note
@@ -39,9 +39,7 @@ from chronoscene.scene.splits import split_hash
 @click.option("--rename", metavar="OLD=NEW", multiple=True,
               help="Give a period (label or id) another label, or an image another name. Periods "
               "that get the same label are merged. May be repeated.")  # fmt: skip
-@click.option(
-    "--link", type=click.Choice(["hard", "sym"]), help="Link the images instead of copying them."
-)
+@LINK
 @reading_options("SCENE")
 def command(
     source: Path,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import PATH, reading_options
+from chronoscene.cli.options import LINK, PATH, reading_options
 from chronoscene.cli.output import check_place, emit, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, show_note
@@ -25,9 +25,7 @@ from chronoscene.registration.triangulation import Triangulated, triangulate
     type=click.IntRange(1),
     help="With 1, every run gives bit-identical results.  [default: one per processor]",
 )
-@click.option(
-    "--link", type=click.Choice(["hard", "sym"]), help="Link the images instead of copying them."
-)
+@LINK
 @reading_options("SCENE")
 def command(
     source: Path,

@@ -77,7 +77,7 @@ def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = 
     Raises:
         ConfigError: If there are no Gaussians, or the run has no filter.
     """
-    if viewers == "antialiased" and not _is_filtered(run):
+    if viewers == "antialiased" and not run.is_filtered:
         raise ConfigError(
             "--for antialiased",
             expected="a run that was trained with the filter of antialiased",
@@ -94,7 +94,7 @@ def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = 
             found="none",
             todo="train the run for longer, or choose another period",
         )
-    if viewers == "antialiased" or not _is_filtered(run):
+    if viewers == "antialiased" or not run.is_filtered:
         return Prepared(cloud, offset, antialiased=viewers == "antialiased")
     return _adapted(run, scene, period, Prepared(cloud, offset, antialiased=True), viewers)
 
@@ -152,7 +152,7 @@ def measure_loss(
         None where no photo shows anything.
     """
     store = ImageStore(scene, max_width=run.record.max_width)
-    model, filtered, values = run.model(period), _is_filtered(run), []
+    model, filtered, values = run.model(period), run.is_filtered, []
     for frame, view in zip(frames, run.frame_views(scene, frames), strict=True):
         photo, mask = store.load(frame), store.load_mask(frame)
         if mask is None or mask.any():
@@ -190,10 +190,6 @@ def _adapted(
     if with_filter is None or without is None or with_filter.filtered is None:
         return plain
     return plain if with_filter.filtered - without.plain < LIMIT_DB else filtered
-
-
-def _is_filtered(run: TrainedRun) -> bool:
-    return bool(getattr(run.config, "antialiased", False))
 
 
 def _comments(

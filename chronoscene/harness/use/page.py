@@ -96,7 +96,7 @@ def write_page(
         for frame in _test_first(frames):
             if frame.split == "test" and photos.size < TEST_PHOTO_SHARE * max_bytes:
                 photos.add(frame, room)
-        filtered = [bool(getattr(run.config, "antialiased", False)) for run in runs]
+        filtered = [run.is_filtered for run in runs]
         report("packing", 0, 1)
         packed, reduction = fit_gaussians(clouds, filtered, room - photos.size)
         size = sum(len(each.text) for each in packed)
@@ -201,7 +201,7 @@ def _document(
                 "name": run.spec.title,
                 "file": f"run-{i}",
                 "near": _near_plane(run) * page_from_world.scale,
-                "antialiased": bool(getattr(run.config, "antialiased", False)),
+                "antialiased": run.is_filtered,
             }
             for i, run in enumerate(runs)
         ],

@@ -68,6 +68,11 @@ class TrainedRun:
         return STRATEGIES[self.record.strategy]
 
     @property
+    def is_filtered(self) -> bool:
+        """True if the models are drawn with the antialiasing filter."""
+        return bool(getattr(self.config, "antialiased", False))
+
+    @property
     def num_periods(self) -> int:
         """Number of periods that its models know."""
         return len(self.record.period_labels)

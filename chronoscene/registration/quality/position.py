@@ -123,7 +123,7 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     # Control that could not move the model is as independent as check points.
     checks = [r for r in points if r.role == "check" or not controlled]
     used = [r for r in points if r.used]
-    found, control, gps = _of_points(checks), _of_points(used), _gps(model)
+    found, control, gps = _of_points(checks), _of_points(used), _against_gps(model)
     pixels = [r.ground_pixel for r in points if r.ground_pixel is not None]
     pixel = float(np.median(pixels)) if pixels else None
     objections = [
@@ -136,7 +136,7 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if found is not None:
         objections += check(POSITION_THRESHOLDS["points"], found.count, "check points", "points")
     if points and gps is not None:
-        gap = float(np.linalg.norm(_gps_gap(model)))
+        gap = float(np.linalg.norm(np.median(_gps_errors(model)[1][:, :2], axis=0)))
         objections += check(POSITION_THRESHOLDS["gps"], gap, "ground control and GPS", "gps")
     objections += _unproven(found, control, gps)
     objections.sort(key=lambda f: f.level != "fail")
@@ -166,20 +166,19 @@ def _rmse(names: Sequence[str], errors: Array) -> Rmse | None:
     )
 
 
-def _gps(model: Registered) -> Rmse | None:
-    """Errors of the cameras against the GPS positions that took part in the estimation."""
+def _against_gps(model: Registered) -> Rmse | None:
+    return None if model.georeference is None else _rmse(*_gps_errors(model))
+
+
+def _gps_errors(model: Registered) -> tuple[list[str], Array]:
+    """Subtract the GPS positions that took part in the estimation from the cameras.
+
+    Returns:
+        Names of their images, and errors in metres. [G, 3]
+    """
     use = np.flatnonzero(model.gps_used & np.isfinite(model.gps_enu).all(axis=1))
-    if model.georeference is None:
-        return None
     errors = camera_centre(model.cam_from_world[use]) - model.gps_enu[use]
-    return _rmse([model.names[i] for i in use], errors)
-
-
-def _gps_gap(model: Registered) -> Array:
-    """Median of the cameras minus their GPS positions, east and north, metres. [2]"""
-    use = model.gps_used & np.isfinite(model.gps_enu).all(axis=1)
-    gaps = camera_centre(model.cam_from_world[use]) - model.gps_enu[use]
-    return np.asarray(np.median(gaps[:, :2], axis=0))
+    return [model.names[i] for i in use], errors
 
 
 def _errors(place: str, rmse: Rmse | None, pixel: float | None) -> Iterator[Objection]:

@@ -148,7 +148,7 @@ def test_intervals_hold_the_truth() -> None:
 
 
 def test_bounds_are_as_far_away_as_the_errors_are_large(exact: Generated) -> None:
-    """Of a known motion, measured with noisy pixels: bounds can be too tight, and too wide."""
+    """A known motion, measured with noisy pixels: bounds can be too tight, and too wide."""
     turn = Rotation.from_euler("x", 1, degrees=True).as_matrix()
     move = Sim3(1.0, turn, np.array([0.5, 0.3, -0.4]))
     model = moved_period(exact.model, move)

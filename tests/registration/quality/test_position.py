@@ -29,7 +29,7 @@ from chronoscene.scene.similarity import Sim3, fit
 UTM = read_reference_system("", "EPSG:32632")
 
 FRAME = Georeference(51.0, 11.0, 200.0, "as stated")
-"""Of the truth: two degrees east of the central meridian of `UTM`."""
+"""Origin of the truth: two degrees east of the central meridian of `UTM`."""
 
 PLACES = np.array(
     [[0, 0, 0], [25, 5, 8], [-20, 18, 3], [10, -24, 12], [-15, -12, 5], [18, 22, 1], [3, 9, 15],
