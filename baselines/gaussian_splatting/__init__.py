@@ -19,19 +19,6 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
 }
 
-_TUNED: dict[str, Any] = {  # docs/experiments/tuning.md
-    "initial_opacity": 0.2035,
-    "position_lr_initial": 4.064e-05,
-    "sh_dc_lr": 3.136e-4,
-    "opacity_lr": 0.04541,
-    "scale_lr": 7.952e-3,
-    "rotation_lr": 6.368e-4,
-    "ssim_weight": 0.3351,
-    "cooldown": 0.1043,
-    "gradient_threshold": 1.1e-4,
-    "densify_interval": 173,
-}
-
 SPEC = MethodSpec(
     name="3dgs",
     title="3DGS",
@@ -42,7 +29,7 @@ SPEC = MethodSpec(
     devices=("cpu", "cuda"),
     method="baselines.gaussian_splatting.method:GaussianSplatting",
     config="chronoscene.gaussians.config:GaussianConfig",
-    presets=_PRESETS | {"fast": _PRESETS["fast"] | _TUNED},
+    presets=_PRESETS,
     resumable=True,
     main_options=(
         *MAIN_OPTIONS,

@@ -78,7 +78,7 @@ def test_presets_are_configurations(preset):
 
 
 @pytest.mark.parametrize(
-    ("preset", "resets", "rounds"), [("accurate", 1, 39), ("balanced", 1, 15), ("fast", 0, 2)]
+    ("preset", "resets", "rounds"), [("accurate", 1, 39), ("balanced", 1, 15), ("fast", 0, 5)]
 )
 def test_short_presets_reset_while_there_is_time_to_recover(preset, resets, rounds):
     config = build_config(SPEC, preset=preset)

@@ -54,7 +54,7 @@ def command(
     dataset_format: str | None,
     period_by: str | None,
 ) -> None:
-    """Leave out images, periods or points, and rename periods or images.
+    """Drop images, periods or points; rename periods or images.
 
     OUT is a new folder in the ChronoScene format; SCENE is not changed. An image stays if all
     options allow it. Periods are numbered anew where one goes; the split of the remaining images,
