@@ -20,6 +20,7 @@ OPENING = (
     "compress RUN",
     "export RUN --period 0 --out OUT",
     "leakage RUN",
+    "page RUN --out OUT",
     "render RUN --out OUT",
 )
 """Commands that need the model of a run."""
@@ -70,7 +71,7 @@ def test_every_command_is_tried_or_reads_no_runs():
 def stranger(trained, tmp_path, monkeypatch):
     """A folder of one run, with modules in it; the folder of the run is the current one."""
     runs, mark = tmp_path / "runs", tmp_path / "executed"
-    run = runs / "ring/run/seed0"  # short: messages cut long paths
+    run = runs / trained["3dgs-period"].relative_to(trained["3dgs-period"].parents[2])
     shutil.copytree(trained["3dgs-period"], run)
     truth = "ground_truth/ring"
     shutil.copytree(trained["3dgs-period"].parents[2] / truth, runs / truth)
@@ -92,14 +93,16 @@ def invoke(line, run, scene_folder, tmp_path):
 def test_a_module_that_a_run_names_is_not_imported(stranger, scene_folder, tmp_path, line):
     run, mark = stranger
     source = json.loads((run / SOURCE_FILE).read_text())
-    named = {"method": "foreign:SPEC", "plugin_path": str(run)}
+    place = tmp_path / "r"  # messages cut long paths
+    place.symlink_to(run)
+    named = {"method": "foreign:SPEC", "plugin_path": str(place)}
     (run / SOURCE_FILE).write_text(json.dumps(source | named))
     result = invoke(line, run, scene_folder, tmp_path)
     assert not mark.exists()
     assert not isinstance(result.exception, ImportError) and "foreign" not in sys.modules
     if line in OPENING:
         assert isinstance(result.exception, ChronoSceneError)
-        for told in ("3dgs-period", "foreign:SPEC", str(run), "--plugin module:SPEC"):
+        for told in ("3dgs-period", "foreign:SPEC", str(place), "--plugin module:SPEC"):
             assert told in str(result.exception)
 
 
