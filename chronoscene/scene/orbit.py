@@ -29,8 +29,15 @@ def find_up(poses: Array) -> Array:
     return np.asarray(up if up @ guess >= 0 else -up)
 
 
-def orbit(poses: Array, points: Array, count: int) -> Array:
-    """Make poses around the median of the points, at median distance and height of the cameras.
+def orbit(
+    poses: Array,
+    points: Array,
+    count: int,
+    *,
+    radius: float | None = None,
+    height: float | None = None,
+) -> Array:
+    """Make poses around the median of the points.
 
     The path begins where the first camera is. It is a full circle if there are cameras on all
     sides, else it swings over the side that has them.
@@ -39,6 +46,9 @@ def orbit(poses: Array, points: Array, count: int) -> Array:
         poses: ``cam_from_world`` of the cameras. [C, 4, 4]
         points: Points of the scene. [P, 3]
         count: Number of poses.
+        radius: Level distance from the median of the points; None for the median distance of the
+            cameras.
+        height: Height above the median of the points; None for the median height of the cameras.
 
     Returns:
         poses: The end of the path leads to its beginning. [count, 4, 4]
@@ -47,9 +57,11 @@ def orbit(poses: Array, points: Array, count: int) -> Array:
     offsets = camera_centre(poses) - target
     heights = offsets @ up
     level = offsets - heights[:, None] * up
-    height, distances = np.median(heights), np.linalg.norm(level, axis=1)
+    distances = np.linalg.norm(level, axis=1)
+    height = float(np.median(heights)) if height is None else height
+    radius = float(np.median(distances)) if radius is None else radius
     # A camera right above the target would have no direction that is up in its image.
-    radius = max(np.median(distances), 0.05 * abs(height), 1e-6)
+    radius = max(radius, 0.05 * abs(height), 1e-6)
     x_axis = level[np.argmax(distances)] / max(distances.max(), 1e-9)
     if distances.max() <= 1e-9:
         x_axis = np.linalg.svd(up[None])[2][1]

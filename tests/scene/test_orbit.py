@@ -33,6 +33,13 @@ def test_cameras_on_all_sides_give_a_circle_from_the_first_one_on():
     np.testing.assert_allclose(np.unwrap(angles), 0.4 + 2 * np.pi * np.arange(8) / 8, atol=0.03)
 
 
+def test_a_radius_and_a_height_of_ones_own():
+    poses = orbit(ring(np.linspace(0.4, 6.4, 20)), POINTS, 8, radius=3.0, height=-2.0)
+    _, distances, heights = places(poses)
+    np.testing.assert_allclose(distances, 3, atol=0.1)
+    np.testing.assert_allclose(heights, -2, atol=0.1)
+
+
 def test_cameras_on_one_side_give_a_swing_over_that_side():
     angles, _, _ = places(orbit(ring(np.linspace(-0.5, 0.9, 20)), POINTS, 40))
     assert angles[0] == pytest.approx(-0.5, abs=0.02)

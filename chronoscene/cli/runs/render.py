@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from mimetypes import guess_type
 from pathlib import Path
 
@@ -11,7 +12,13 @@ from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, check_place, report_written
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
-from chronoscene.harness.use.cameras import VIEWS, find_viewpoints, with_periods
+from chronoscene.harness.use.cameras import (
+    LARGEST_SIDE,
+    VIEWS,
+    OrbitShape,
+    find_viewpoints,
+    with_periods,
+)
 from chronoscene.harness.use.rendering import (
     check_viewpoints,
     is_animation,
@@ -20,6 +27,28 @@ from chronoscene.harness.use.rendering import (
 )
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside
+
+
+def parse_size(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[int, int] | None:
+    """Parse ``WIDTHxHEIGHT``, as a click callback."""
+    if value is None:
+        return None
+    width, _, height = value.lower().partition("x")
+    if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
+        raise click.BadParameter(f"expected WIDTHxHEIGHT, such as 1280x720, found {value!r}")
+    size = int(width), int(height)
+    if not all(1 <= side <= LARGEST_SIDE for side in size):
+        raise click.BadParameter(f"expected sides from 1 to {LARGEST_SIDE} pixels, found {value!r}")
+    return size
+
+
+def check_finite(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+    """Refuse infinity and NaN, as a click callback."""
+    if value is not None and not math.isfinite(value):
+        raise click.BadParameter(f"expected a finite number, found {value}")
+    return value
 
 
 @click.command("render")
@@ -55,6 +84,24 @@ from chronoscene.io.staging import check_outside
     default=24,
     help="Pictures per second of an animation.",
 )
+@click.option(
+    "--size",
+    metavar="WIDTHxHEIGHT",
+    callback=parse_size,
+    help="Pixels of the pictures of an orbit.  [default: the size of the evaluation]",
+)
+@click.option(
+    "--radius",
+    type=click.FloatRange(min=0, min_open=True),
+    callback=check_finite,
+    help="Level distance of an orbit from the middle of the sparse points, in units of the scene.",
+)
+@click.option(
+    "--height",
+    type=float,
+    callback=check_finite,
+    help="Height of an orbit above the middle of the sparse points, in units of the scene.",
+)
 @SCENE
 @STAGE
 @PLUGIN
@@ -67,6 +114,9 @@ def command(
     appearance_period: str | None,
     frames: int,
     fps: float,
+    size: tuple[int, int] | None,
+    radius: float | None,
+    height: float | None,
     scene: Path | None,
     stage: int | None,
     device: str,
@@ -75,7 +125,8 @@ def command(
     """Render a finished run from any camera.
 
     RUN is the folder of the run, such as runs/plaza/chronogs-joint-balanced/seed0. An orbit circles
-    the middle of the sparse points, at the height and distance of the cameras.
+    the middle of the sparse points, at the height and distance of the cameras unless others are
+    given.
     """
     run = open_run(folder, device=device, plugin=plugin, stage=stage)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
@@ -92,7 +143,8 @@ def command(
         check_place("--out", out)
     periods = () if period is None else run.parse_periods(period)
     appearance = None if appearance_period is None else run.parse_period(appearance_period)
-    viewpoints = with_periods(find_viewpoints(cameras, run, scene, frames), run, periods, frames)
+    found = find_viewpoints(cameras, run, scene, frames, OrbitShape(size, radius, height))
+    viewpoints = with_periods(found, run, periods, frames)
     check_viewpoints(run, viewpoints, out, appearance)
     images = render_viewpoints(run, viewpoints, appearance_period=appearance)
     names = (viewpoint.name for viewpoint in viewpoints)

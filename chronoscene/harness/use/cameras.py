@@ -26,6 +26,9 @@ from chronoscene.scene.similarity import Sim3
 VIEWS = ("test", "all", "orbit")
 """Cameras that follow from the scene."""
 
+LARGEST_SIDE = 16384
+"""Largest width and height of a picture, in pixels."""
+
 NORMALISED = "dataparser_transforms.json"
 """File of nerfstudio with the transform from the world to the frame of a model."""
 
@@ -53,8 +56,24 @@ class CameraSequence:
     """True if they are a moving camera."""
 
 
+@dataclass(frozen=True, slots=True)
+class OrbitShape:
+    """How an orbit is to differ from what the cameras of the scene give."""
+
+    size: tuple[int, int] | None = None
+    """Width and height of its pictures in pixels; None for those of the evaluation."""
+    radius: float | None = None
+    """Level distance from the middle of the points, in units of the scene."""
+    height: float | None = None
+    """Height above the middle of the points, in units of the scene."""
+
+
 def find_viewpoints(
-    source: str, run: TrainedRun, scene_root: Path | None, frames: int
+    source: str,
+    run: TrainedRun,
+    scene_root: Path | None,
+    frames: int,
+    shape: OrbitShape | None = None,
 ) -> CameraSequence:
     """Return the cameras that ``--cameras`` names.
 
@@ -63,11 +82,21 @@ def find_viewpoints(
         run: Run whose scene and largest image width are used.
         scene_root: Folder of the scene; None if it has not moved.
         frames: Number of pictures of an orbit.
+        shape: How an orbit is to differ from what the scene gives.
 
     Raises:
-        ConfigError: If the source is none of these, or has no camera.
+        ConfigError: If the source is none of these, or has no camera, or is no orbit and has the
+            shape of one.
         SceneError: If the scene or the file is missing, damaged, or of an unknown kind.
     """
+    shape = shape or OrbitShape()
+    if source != "orbit" and shape != OrbitShape():
+        raise ConfigError(
+            "--size, --radius, --height",
+            expected="--cameras orbit, as other cameras have their own size and place",
+            found=f"--cameras {source}",
+            todo="leave them out",
+        )
     if source in VIEWS:
         scene = run.scene(scene_root)
         if source == "test" and not scene.select(split="test"):
@@ -77,7 +106,9 @@ def find_viewpoints(
                 found=f"none in {scene.root}",
                 todo="use --cameras all",
             )
-        return _around(run, scene, frames) if source == "orbit" else _of_scene(run, scene, source)
+        if source == "orbit":
+            return _around(run, scene, frames, shape)
+        return _of_scene(run, scene, source)
     path = Path(source)
     if path.is_dir():
         return _of_model(run, path)
@@ -151,13 +182,22 @@ def _of_scene(run: TrainedRun, scene: Scene, split: str) -> CameraSequence:
     return CameraSequence(tuple(viewpoints), is_path=False)
 
 
-def _around(run: TrainedRun, scene: Scene, frames: int) -> CameraSequence:
+def _around(run: TrainedRun, scene: Scene, frames: int, shape: OrbitShape) -> CameraSequence:
     poses = np.stack([frame.cam_from_world for frame in scene.frames])
     camera = ImageStore(scene, max_width=run.record.max_width).camera(scene.frames[0])
-    path = orbit(poses, scene.points.xyz, frames)
+    if shape.size is not None:
+        camera = _with_size(camera, *shape.size)
+    points = scene.points.xyz
+    path = orbit(poses, points, frames, radius=shape.radius, height=shape.height)
     return CameraSequence(
         tuple(Viewpoint(_numbered(i), camera, p, None) for i, p in enumerate(path)), True
     )
+
+
+def _with_size(camera: Camera, width: int, height: int) -> Camera:
+    """Return a camera of this size with the same horizontal field of view."""
+    focal = camera.K[0, 0] * width / camera.width
+    return Camera(1, "SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
 
 
 def _numbered(i: int) -> str:
@@ -203,7 +243,7 @@ def _of_path(run: TrainedRun, path: Path) -> CameraSequence:
 
 def _side(path: Path, data: Mapping[str, Any], key: str) -> int:
     value = number(path, data, key)
-    if value is None or not 1 <= value <= 16384 or value != int(value):
+    if value is None or not 1 <= value <= LARGEST_SIDE or value != int(value):
         raise json_error(path, f"{key} in whole pixels", repr(data.get(key))[:40])
     return int(value)
 

@@ -10,7 +10,7 @@ import pytest
 from chronoscene.colmap.model import write_model
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.shared.transforms import opengl_from_pose
-from chronoscene.harness.use.cameras import NORMALISED, find_viewpoints, with_periods
+from chronoscene.harness.use.cameras import NORMALISED, OrbitShape, find_viewpoints, with_periods
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
@@ -50,6 +50,14 @@ def test_an_orbit_is_in_the_world_and_has_as_many_pictures_as_asked_for(run):
     poses = np.stack([viewpoint.cam_from_world for viewpoint in viewpoints.viewpoints])
     cameras = camera_centre(np.stack([f.cam_from_world for f in run.scene().frames]))
     assert np.abs(camera_centre(poses)).max() < 1.5 * np.abs(cameras).max()
+
+
+def test_an_orbit_of_another_size_keeps_the_horizontal_field_of_view(run):
+    shape = OrbitShape(size=(48, 10), radius=3.0, height=2.0)
+    camera = find_viewpoints("orbit", run, None, 1, shape).viewpoints[0].camera
+    usual = viewpoints_of(run, "orbit", 1).viewpoints[0].camera
+    assert camera.size == (48, 10)
+    assert camera.K[0, 0] / 48 == pytest.approx(usual.K[0, 0] / usual.width)
 
 
 def test_a_model_of_colmap_without_distortion_and_at_most_as_wide_as_the_run(run, tmp_path):

@@ -45,6 +45,14 @@ def test_an_orbit_through_the_periods_as_a_film(trained, tmp_path):
     assert len(frames) == 5 and frames[0].shape == (16, 24, 3)
 
 
+def test_an_orbit_of_another_size_and_shape(trained, tmp_path):
+    options = ("--cameras", "orbit", "--period", "0", "--frames", 2, "--size", "30x10")
+    for radius in (3, 6):
+        render(trained["chronogs"], tmp_path / str(radius), *options, "--radius", radius)
+    near, far = (np.asarray(Image.open(tmp_path / r / "0000.png")) for r in ("3", "6"))
+    assert near.shape == far.shape == (10, 30, 3) and (near != far).any()
+
+
 @pytest.mark.parametrize("name", ["chronogs", "3dgs-period"])
 def test_the_geometry_of_a_period_in_the_light_of_another(trained, name):
     run = open_run(trained[name])
@@ -74,6 +82,7 @@ def test_methods_without_geometry_of_their_own_refuse_another_light(runs, traine
         (("--period", "winter"), "period 'winter': .*choose among 0 .spring., 1 .autumn."),
         (("--period", "0:0.5"), "period 0.5: expected a whole number: 4DGS under strategy sep"),
         (("--cameras", "orbit"), "--period: expected a period"),
+        (("--radius", 3), "--size, --radius, --height: expected --cameras orbit"),
     ],
 )
 def test_what_a_run_cannot_show(trained, tmp_path, options, message):
