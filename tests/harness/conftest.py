@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -19,9 +17,10 @@ from chronoscene.formats import chronoscene as scene_format
 from chronoscene.harness.files.records import Failure, read_run
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.settings import bench_settings
-from chronoscene.harness.run.process import put_in_place
+from chronoscene.harness.run.process import put_in_place, run_in_process, staged
 from chronoscene.harness.run.runner import BenchOutcome, run_bench
 from chronoscene.harness.train.worker import execute
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 
 PLUGINS = Path(__file__).parent / "plugins"
@@ -134,6 +133,11 @@ def toys() -> Iterator[None]:
         os.environ["PYTHONPATH"] = before
 
 
+def full_names(methods: Sequence[str]) -> tuple[str, ...]:
+    """Names of installed methods, and of toy methods, which are upper case: ``MEAN``."""
+    return tuple(f"toy_methods:{name}" if name.isupper() else name for name in methods)
+
+
 Bench = Callable[..., tuple[BenchOutcome, list[str]]]
 
 
@@ -145,7 +149,7 @@ def bench(scene_folder: Path, tmp_path: Path) -> Bench:
         said: list[str] = []
         fields: dict[str, Any] = {
             "scenes": (scene_folder,),
-            "methods": tuple(f"toy_methods:{name}" for name in methods),
+            "methods": full_names(methods),
             "runs": tmp_path / "runs",
             "threads": 1,
         }
@@ -157,10 +161,12 @@ def bench(scene_folder: Path, tmp_path: Path) -> Bench:
 
 def execute_here(job: Job) -> Failure | None:
     """A job in this process, which costs no time to start."""
-    staging = Path(mkdtemp(dir=job.settings.runs))
-    execute(replace(job, staging=str(staging)).document(), lambda *progress: None)
-    job.folder.parent.mkdir(parents=True, exist_ok=True)
-    return put_in_place(job, staging)
+    with staged(job) as job:
+        try:
+            execute(job.document(), lambda *progress: None)
+        finally:
+            set_threads(None)
+    return put_in_place(job, Path(job.staging))
 
 
 @pytest.fixture
@@ -170,7 +176,11 @@ def bench_here(scene_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
     def run(*methods: str, **changes: Any) -> tuple[BenchOutcome, list[str]]:
         said: list[str] = []
-        fields = {"scenes": (scene_folder,), "methods": methods, "runs": tmp_path / "runs"}
+        fields = {
+            "scenes": (scene_folder,),
+            "methods": full_names(methods),
+            "runs": tmp_path / "runs",
+        }
         settings = bench_settings(**{**fields, **changes})
         return run_bench(settings, said.append, execute=execute_here), said
 
@@ -185,13 +195,12 @@ def finished_bench(
     runs = tmp_path_factory.mktemp("bench") / "runs"
     said: list[str] = []
     names = ("MEAN", "BLIND", "RAISES", "NOT_FINITE", "KILLED")
-    first = bench_settings(
-        scenes=(scene_folder,),
-        methods=tuple(f"toy_methods:{name}" for name in names),
-        runs=runs,
-        threads=1,
+    first = bench_settings(scenes=(scene_folder,), methods=full_names(names), runs=runs, threads=1)
+    outcome = run_bench(
+        first,
+        said.append,
+        execute=lambda job: (run_in_process if job.method_name == "killed" else execute_here)(job),
     )
-    outcome = run_bench(first, said.append)
     others = bench_settings(
         scenes=(scene_folder,),
         methods=("toy_methods:MEAN",),
@@ -199,7 +208,7 @@ def finished_bench(
         threads=1,
         strategies=("pooled", "separate"),
     )
-    run_bench(others, said.append)
+    run_bench(others, said.append, execute=execute_here)
     return runs, outcome, said
 
 

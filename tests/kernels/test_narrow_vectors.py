@@ -17,11 +17,7 @@ NARROWER = {
     "8 lanes": ("haswell", "+avx,+avx2,+fma,+bmi,+bmi2,+popcnt,+lzcnt,+f16c,+movbe,+sse4.2"),
     "4 lanes": ("x86-64", "+sse2"),
 }
-SMALL_TESTS = (
-    "kernels/test_vectors.py",
-    "rasterizer/test_agreement.py::test_sizes",
-    "registration/features/test_nearest.py",
-)
+SMALL_TESTS = ("kernels/test_vectors.py", "registration/features/test_nearest.py")
 LARGE_TESTS = (
     "rasterizer/test_agreement.py",
     "rasterizer/test_extremes.py",

@@ -38,8 +38,16 @@ REFUSED = [e for e in EXTREMES if e.outcome not in (AGREES, CULLED)]
 MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 
 
+LONG = ("1e5 on one pixel", "an image of 8191 x 1")
+"""The reference takes ten seconds and more for each of these."""
+
+
 def named(extremes: list[Extreme]) -> Any:
-    return pytest.mark.parametrize("extreme", extremes, ids=lambda e: e.name)
+    params = [
+        pytest.param(e, id=e.name, marks=pytest.mark.slow if e.name in LONG else ())
+        for e in extremes
+    ]
+    return pytest.mark.parametrize("extreme", params)
 
 
 def assert_close(

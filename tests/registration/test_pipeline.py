@@ -204,6 +204,7 @@ def check_finished(out: Path, uninterrupted: Path) -> set[str]:
     return {s["stage"] for s in stages if s["from_an_earlier_run"]}
 
 
+@pytest.mark.slow
 def test_a_killed_command_goes_on(
     joint: tuple[Path, Registered], captures: Path, tmp_path: Path
 ) -> None:

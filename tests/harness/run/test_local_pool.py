@@ -23,8 +23,8 @@ from ..train.test_interruption import wait_for
 FILES = ("checkpoint/model.json", "predictions/manifest.json", "rows.csv", "source.json")
 
 
-def test_results_do_not_depend_on_how_many_run_at_a_time(bench, tmp_path):
-    one, _ = bench("DRAWING", seeds=(0, 1), runs=tmp_path / "one")
+def test_results_do_not_depend_on_how_many_run_at_a_time(bench, bench_here, tmp_path):
+    one, _ = bench_here("DRAWING", seeds=(0, 1), runs=tmp_path / "one", threads=1)
     two, said = bench("DRAWING", seeds=(0, 1), runs=tmp_path / "two", jobs=2)
     assert two.failures == () and [f.name for f in two.finished] == ["seed0", "seed1"]
     for a, b in zip(one.finished, two.finished, strict=True):

@@ -18,6 +18,7 @@ from chronoscene.harness.run import ray_pool
 from chronoscene.harness.run.runner import run_bench
 from chronoscene.io.processes import process_tree
 
+from ..conftest import execute_here
 from ..plan.test_job import JOB
 from ..train.test_interruption import wait_for
 
@@ -94,7 +95,9 @@ def test_results_are_those_of_a_local_run(on_ray, scene_folder, tmp_path):
     for found in outcome.finished:
         method = names["methods"]["3dgs" in found.parent.name]
         (one,) = run_bench(
-            bench_settings(**local, **{**names, "methods": (method,)}), lambda line: None
+            bench_settings(**local, **{**names, "methods": (method,)}),
+            lambda line: None,
+            execute=execute_here,
         ).finished
         assert files_of(found) == files_of(one)
         ours, theirs = read_run(one), read_run(found)
@@ -104,6 +107,7 @@ def test_results_are_those_of_a_local_run(on_ray, scene_folder, tmp_path):
     assert longer.failures == () and read_run(longer.finished[0]).iterations == 20
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_stops_nobody_else(on_ray):
     outcome, said = on_ray("FULL_DISK", "RAISES", "KILLED", "ORPHANED", "MEAN")
     assert [folder.parent.name for folder in outcome.finished] == ["mean-joint-balanced"]
@@ -163,9 +167,8 @@ def workers():
     return found
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_runs_end_with_their_bench(number, on_ray, cluster, scene_folder, tmp_path):
     runs, hold = tmp_path / "runs", cluster.hold
     hold.touch()

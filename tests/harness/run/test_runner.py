@@ -139,10 +139,10 @@ def test_the_dataset_is_left_alone(scene_folder, finished_bench):
     assert files == {"images", "sparse"}
 
 
-def test_finished_runs_are_kept_and_failed_ones_tried_again(bench, runs):
+def test_finished_runs_are_kept_and_failed_ones_tried_again(bench_here, runs):
     folder = runs / "ring/mean-joint-balanced/seed0"
     before = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.rglob("*") if p.is_file()}
-    outcome, said = bench("MEAN", "RAISES", runs=runs)
+    outcome, said = bench_here("MEAN", "RAISES", runs=runs)
     after = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.rglob("*") if p.is_file()}
     assert after == before
     assert outcome.skipped == 1 and outcome.finished == (folder,)
@@ -150,12 +150,12 @@ def test_finished_runs_are_kept_and_failed_ones_tried_again(bench, runs):
     assert [f.method for f in outcome.failures] == ["raises"]
 
 
-def test_other_settings_are_refused_or_replace(bench, runs):
+def test_other_settings_are_refused_or_replace(bench_here, runs):
     folder = runs / "ring/mean-joint-balanced/seed0"
     with pytest.raises(ConfigError, match=r"with device cpu, found .* with device auto;"):
-        bench("MEAN", runs=runs, device="cpu")
+        bench_here("MEAN", runs=runs, device="cpu")
     assert records.read_config(folder)["device"] == "auto"
-    bench("MEAN", runs=runs, device="cpu", overwrite=True)
+    bench_here("MEAN", runs=runs, device="cpu", overwrite=True)
     assert records.read_config(folder)["device"] == "cpu"
 
 
@@ -226,9 +226,9 @@ def test_without_test_views_nothing_is_scored(scene_folder, bench_here, tmp_path
     assert f"absent: {metrics}, drawn per view, rendering [ms]: {reason}\n" in table
 
 
-def test_seeds_overrides_and_budgets(bench):
+def test_seeds_overrides_and_budgets(bench_here):
     overrides = {"sleep": "0.01", "mean.rate": "0.25"}
-    outcome, said = bench("MEAN", budget_seconds=0.4, seeds=(3,), overrides=overrides)
+    outcome, said = bench_here("MEAN", budget_seconds=0.4, seeds=(3,), overrides=overrides)
     (folder,) = outcome.finished
     record = read_run(folder)
     assert folder.name == "seed3" and record.seed == 3
@@ -251,20 +251,22 @@ def test_a_full_disk_ends_the_bench_and_leaves_nothing_half(bench, tmp_path):
 
 
 @pytest.mark.parametrize("strategy", ["separate", "sequential"])
-def test_separate_models_and_stages_share_or_repeat(bench, strategy):
-    each, said = bench("MEAN", strategies=(strategy,), iterations=9, separate_iterations="each")
+def test_separate_models_and_stages_share_or_repeat(bench_here, strategy):
+    each, said = bench_here(
+        "MEAN", strategies=(strategy,), iterations=9, separate_iterations="each"
+    )
     assert read_run(each.finished[0]).iterations == 18
     assert any(line.endswith("has all iterations and time") for line in said)
 
 
-def test_presets_may_mean_their_iterations_for_each_period(bench):
+def test_presets_may_mean_their_iterations_for_each_period(bench_here):
     """Two periods: 18 steps, of which each model or stage of one period does 9."""
     strategies = ("joint", "separate", "sequential", "pooled")
-    each, said = bench("DATED", strategies=strategies, iterations=9)
+    each, said = bench_here("DATED", strategies=strategies, iterations=9)
     assert [read_run(folder).iterations for folder in each.finished] == [18, 18, 18, 9]
     assert {read_run(folder).variant for folder in each.finished} == {"iterations=9"}
     assert any(line.endswith("once for each period") for line in said)
-    total, _ = bench("DATED", strategies=strategies, iterations=9, separate_iterations="total")
+    total, _ = bench_here("DATED", strategies=strategies, iterations=9, separate_iterations="total")
     assert [read_run(folder).iterations for folder in total.finished] == [9] * 4
     variant = "iterations=9,separate_iterations=total"
     assert {read_run(folder).variant for folder in total.finished} == {variant}
@@ -314,19 +316,19 @@ def test_a_scene_that_is_none(bench, tmp_path):
         bench("MEAN", scenes=(tmp_path,))
 
 
-def test_images_are_trained_and_scored_at_the_evaluation_size(bench):
-    outcome, _ = bench("MEAN", max_width=12)
+def test_images_are_trained_and_scored_at_the_evaluation_size(bench_here):
+    outcome, _ = bench_here("MEAN", max_width=12)
     assert outcome.failures == ()
     (folder,) = outcome.finished
     assert {(e.width, e.height) for e in read_manifest(folder / "predictions").images} == {(12, 8)}
     assert "ssim_valid" in read_run(folder).skipped
 
 
-def test_memory_is_that_of_the_run_alone(bench, finished_bench):
+def test_memory_is_that_of_the_run_alone(bench):
     """A worker does not inherit the peak of a big parent, and its own arrays count."""
-    low = read_run(finished_bench[0] / "ring/mean-joint-balanced/seed0").peak_memory_bytes
     parent = np.ones(1_000_000_000, np.uint8)
-    outcome, _ = bench("MEAN", overrides={"ballast": "300000000"})
-    high = read_run(outcome.finished[0]).peak_memory_bytes
+    light, _ = bench("MEAN")
+    heavy, _ = bench("MEAN", overrides={"ballast": "300000000"})
+    low, high = (read_run(o.finished[0]).peak_memory_bytes for o in (light, heavy))
     assert parent.all()
     assert 290e6 < high - low < 400e6

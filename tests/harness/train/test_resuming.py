@@ -82,15 +82,15 @@ def kill_later(process, runs, seconds, part="all"):
 
 @pytest.mark.parametrize(("strategy", "part"), [("joint", "all"), ("sequential", "period-1")])
 def test_a_killed_training_ends_as_an_undisturbed_one(
-    bench, scene_folder, tmp_path, strategy, part
+    bench_here, scene_folder, tmp_path, strategy, part
 ):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    options = {"iterations": 150, "strategies": (strategy,)}
-    bench("DRAWING", runs=whole, **options)
+    options = {"iterations": 150, "strategies": (strategy,), "threads": 1}
+    bench_here("DRAWING", runs=whole, **options)
     process = start(scene_folder, TOY, killed, 150, "slow", strategy)
     assert kill_later(process, killed, random.Random(1).uniform(0, 0.3), part)
     assert 0 < checkpoint_of(killed, part) < 150
-    bench("DRAWING", runs=killed, preset="slow", **options)
+    bench_here("DRAWING", runs=killed, preset="slow", **options)
     assert outcome(killed) == outcome(whole)
     record = read_run(run_of(killed))
     assert (record.resumed, record.iterations) == (1, 150)
