@@ -20,6 +20,7 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.checkpoint import TrainingState
 from chronoscene.training.devices import to_device, uniform
 from chronoscene.training.drawing import Splats
+from chronoscene.training.losses import steady_mean
 
 _STREAM = 8  # Keeps the dropout apart from other draws of the same seed
 PAUSE = 300
@@ -71,7 +72,7 @@ class WildTrainer(GaussianTrainer):
 
     def loss(self, raster: Rasterization, number: int, mask: Tensor | None) -> Tensor:
         free = self.model.parameters[COORDINATES][:, :-1]
-        outside = (free.abs() - 1).clamp_min(0.0).mean()
+        outside = steady_mean((free.abs() - 1).clamp_min(0.0))
         return super().loss(raster, number, mask) + self.config.coordinate_weight * outside
 
     def compare(self, image: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
@@ -84,7 +85,7 @@ class WildTrainer(GaussianTrainer):
         loss = super().compare(mine, theirs.detach(), mask)
         # The loss has a gradient in its first argument only, and is the same with both exchanged.
         other = super().compare(theirs, mine.detach(), mask)
-        hidden = (1 - visible).square().mean()
+        hidden = steady_mean((1 - visible).square())
         return loss + (other - other.detach()) + self.config.visibility_weight * hidden
 
     def _visibility_counts(self) -> bool:

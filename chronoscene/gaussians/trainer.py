@@ -29,7 +29,7 @@ from chronoscene.training.devices import to_device
 from chronoscene.training.drawing import Splats, draw_in_training
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import collect_gradients, mask_tensor
-from chronoscene.training.losses import training_loss
+from chronoscene.training.losses import steady_mean, training_loss
 from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.photometric import photometric_loss
 from chronoscene.training.schedules import cooled, log_linear
@@ -224,7 +224,7 @@ class GaussianTrainer:
         config = self.config
         if config.densification != "mcmc":
             return 0.0
-        opacity, scale = splats.opacities.mean(), splats.scales.mean()
+        opacity, scale = steady_mean(splats.opacities), steady_mean(splats.scales)
         return config.mcmc_opacity_weight * opacity + config.mcmc_scale_weight * scale
 
     @torch.no_grad()

@@ -21,6 +21,9 @@ from chronoscene.training.config import SplattingConfig
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.photometric import photometric_loss
 
+_ROW = 1024
+"""Numbers that one thread sums in `steady_mean`."""
+
 _CHUNK = 4096
 """Gaussians summed one after the other; fixed, so the sum does not depend on the threads."""
 
@@ -56,6 +59,20 @@ def training_loss(
     if compare is not None:
         return compare(image, photo, mask)
     return photometric_loss(image, photo, ssim_weight=config.ssim_weight, mask=mask)
+
+
+def steady_mean(values: Tensor) -> Tensor:
+    """Compute the mean of all numbers; equal to the last bit for any number of threads.
+
+    The sum of torch is split among the threads from 32,768 numbers on. Here rows are summed each by
+    one thread, and then their sums, which are too few to be split. The gradient is that of `mean`.
+
+    Args:
+        values: Up to 33 million numbers, of any shape.
+    """
+    count = values.numel()
+    rows = torch.nn.functional.pad(values.flatten(), (0, -count % _ROW)).view(-1, _ROW)
+    return rows.sum(1).sum() / count
 
 
 def mean_volume(scales: Tensor, opacities: Tensor) -> Tensor:

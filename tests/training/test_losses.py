@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from chronoscene.training import devices
-from chronoscene.training.losses import mean_volume
+from chronoscene.training.losses import mean_volume, steady_mean
 
 
 @pytest.fixture(params=["compiled", "torch"])
@@ -17,6 +17,21 @@ def code(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 both_codes = pytest.mark.usefixtures("code")
+
+
+def test_a_steady_mean_is_the_same_for_any_number_of_threads() -> None:
+    values = torch.rand(1_000_003, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    before, means = torch.get_num_threads(), set()
+    try:
+        for threads in (1, 2, 3, 4):
+            torch.set_num_threads(threads)
+            means.add(steady_mean(values).item())
+    finally:
+        torch.set_num_threads(before)
+    (mean,) = means
+    assert mean == pytest.approx(float(values.double().mean()), rel=1e-6)
+    (grad,) = torch.autograd.grad(steady_mean(values), values)
+    torch.testing.assert_close(grad, torch.full_like(grad, 1 / 1_000_003))
 
 
 @both_codes

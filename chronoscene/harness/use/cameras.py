@@ -58,7 +58,7 @@ class CameraSequence:
 
 @dataclass(frozen=True, slots=True)
 class OrbitShape:
-    """How an orbit is to differ from what the cameras of the scene give."""
+    """Size and shape of an orbit where they differ from those of the scene and its cameras."""
 
     size: tuple[int, int] | None = None
     """Width and height of its pictures in pixels; None for those of the evaluation."""
