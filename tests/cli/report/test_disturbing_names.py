@@ -2,16 +2,13 @@
 
 import re
 
-import click
 import made_runs
 import pytest
-from click.testing import CliRunner
+from command_line import run_command
 
-from chronoscene.cli import main
 from chronoscene.harness.files.records import Failure, write_failure, write_summary
 from chronoscene.io.tables import FORMATS
 
-main_alone = click.Command("chronoscene", callback=main)
 ESCAPE = "\x1b]0;title\x07\x1b[2J\u202e"
 
 
@@ -54,11 +51,10 @@ def runs(tmp_path_factory):
         "render RUNS/RUN --out RUNS/out",
     ],
 )
-def test_no_command_passes_them_on(runs, monkeypatch, line):
+def test_no_command_passes_them_on(runs, line):
     run = next(runs.glob("*/3dgs*/seed0")).relative_to(runs)
     words = [word.replace("RUNS/RUN", f"{runs}/{run}") for word in line.split()]
-    monkeypatch.setattr("sys.argv", ["chronoscene", *(w.replace("RUNS", str(runs)) for w in words)])
-    result = CliRunner().invoke(main_alone, color=True)
+    result = run_command(*(word.replace("RUNS", str(runs)) for word in words), color=True)
     print(line, repr(result.output[:150]), len(result.output))
     assert result.output
     shown = re.sub(r"\x1b\[(0|1|3\d)m|\n", "", result.output)

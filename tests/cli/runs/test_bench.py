@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from command_line import run_command
 
 import chronoscene.cli.runs.bench as bench_module
 from chronoscene.cli import cli
@@ -21,17 +22,13 @@ IMAGES = {f"{folder}/{i}.png": period for period, folder in enumerate("ab") for 
 TESTS = ["a/1.png", "b/1.png"]
 
 
-def chronoscene(*arguments, cwd=None):
-    """Run the command in a process of its own."""
-    code = "from chronoscene.cli import main; main()"
-    path = os.pathsep.join(filter(None, [str(PLUGINS), os.environ.get("PYTHONPATH")]))
-    return subprocess.run(
-        [sys.executable, "-P", "-c", code, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": path},
-    )
+def chronoscene(*arguments):
+    """Run the command, which finds the toy methods, as its workers do."""
+    with pytest.MonkeyPatch.context() as patch:
+        path = os.pathsep.join(filter(None, [str(PLUGINS), os.environ.get("PYTHONPATH")]))
+        patch.setenv("PYTHONPATH", path)
+        patch.setattr("sys.path", [str(PLUGINS), *sys.path])
+        return run_command(*arguments)
 
 
 def test_bench_score_and_table(make_scene_folder, tmp_path):
@@ -41,7 +38,7 @@ def test_bench_score_and_table(make_scene_folder, tmp_path):
         "bench", scene, "--method", "toy_methods:MEAN,toy_methods:RAISES", "--out", runs,
         "--set", "mean.rate=0.25", "--iterations", "12", "--threads", "1",
     )  # fmt: skip
-    assert done.returncode == 1, done.stderr
+    assert done.exit_code == 1, done.stderr
     assert "place: PSNR [dB] (psnr), higher is better" in done.stdout
     assert "Mean (joint, balanced, iterations=12, rate=0.25)" in done.stdout
     assert (
@@ -56,11 +53,11 @@ def test_bench_score_and_table(make_scene_folder, tmp_path):
     assert record["method"] == "mean" and record["iterations"] == 12
 
     again = chronoscene("score", runs)
-    assert again.returncode == 0, again.stderr
+    assert again.exit_code == 0, again.stderr
     assert "place/mean-joint-balanced-iterations=12,rate=0.25/seed0: unchanged" in again.stdout
 
     table = chronoscene("table", runs, "--format", "json", "--metric", "psnr")
-    assert table.returncode == 0, table.stderr
+    assert table.exit_code == 0, table.stderr
     entries = json.loads(table.stdout)["entries"]
     macro = [e["mean"] for e in entries if e["column"] == "macro"]
     assert macro == [record["aggregates"]["macro"]["psnr"]]
@@ -84,7 +81,11 @@ def test_a_plug_in_in_the_current_folder(make_scene_folder, tmp_path):
     (tmp_path / "my_method.py").write_text(source)
     # A file that shadows a module of the standard library must do no harm in the worker.
     (tmp_path / "bisect.py").write_text("raise RuntimeError('shadowed')\n")
-    done = chronoscene("bench", scene, "--method", "my_method:MEAN", "--out", "runs", cwd=tmp_path)
+    code = "from chronoscene.cli import main; main()"
+    line = ("bench", str(scene), "--method", "my_method:MEAN", "--out", "runs")
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code, *line], capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "runs/scene/mean-joint-balanced/seed0/run.json").is_file()
 
@@ -221,7 +222,7 @@ def test_wrong_options_are_told(make_scene_folder, arguments, message):
 
 def test_unknown_methods_name_the_known_ones(make_scene_folder):
     done = chronoscene("bench", make_scene_folder(IMAGES, tests=TESTS), "--method", "chronosg")
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert done.stderr.startswith("error: --method: expected one of")
     assert "did you mean 'chronogs'" in done.stderr and "Traceback" not in done.stderr
 

@@ -30,7 +30,7 @@ def test_a_study_of_ones_own(make_scene_folder, tmp_path):
     file.write_text(STUDY)
     call = ("study", file, scene, "--iterations", 12, "--threads", 1, "--out", runs)
     done = chronoscene(*call)
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert "Which rate is better?" in done.stdout
     assert "place, fast: nothing is published to compare with." in done.stdout
     assert "2 of 2 runs are finished and kept" in (again := chronoscene(*call)).stderr
@@ -61,5 +61,5 @@ def test_mistakes_are_one_line(make_scene_folder, tmp_path):
     file.write_text(STUDY.replace("label", "name"))
     for name, text in ((file, "Field required (rows.0.label)"), ("parts", "base-length, comp")):
         done = chronoscene("study", name, scene, "--out", tmp_path / "runs")
-        assert done.returncode == 2 and done.stderr.count("\n") == 1
+        assert done.exit_code == 2 and done.stderr.count("\n") == 1
         assert text in done.stderr

@@ -11,7 +11,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
+from command_line import run_command
 
 from benchmarks.data.skeletons.dataset import write_skeleton
 from chronoscene.cli import cli
@@ -103,21 +104,19 @@ def test_points_that_no_image_sees_are_mentioned(make_scene_folder):
     assert "no image" not in result.stdout
 
 
-def shell(*args: object) -> subprocess.CompletedProcess[str]:
-    code = "from chronoscene.cli import main; main()"
-    command = [sys.executable, "-c", code, "stats", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+def shell(*args: object) -> Result:
+    return run_command("stats", *args)
 
 
 def test_errors_are_one_line_with_status_2(make_scene_folder, tmp_path):
     done = shell(tmp_path)
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "expected a scene of a known format (" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     folder = make_scene_folder()
     (folder / "sparse/split.txt").write_text("a/0001.png\n")
     done = shell(folder)
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert 'split.txt:1: expected "<image name> <period id>"' in done.stderr
     assert "Traceback" not in done.stderr and done.stdout == ""
 
@@ -147,7 +146,7 @@ def test_torch_is_not_needed(make_scene_folder):
 def test_several_scenes_are_read_in_several_processes(make_scene_folder, tmp_path):
     folders = [make_scene_folder(name=f"set/{i}", points=20 + i) for i in range(3)]
     done = shell(tmp_path / "set", "--format", "json")
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     scenes = json.loads(done.stdout)["scenes"]
     assert [(s["name"], s["points"]) for s in scenes] == [("0", 20), ("1", 21), ("2", 22)]
     (folders[1] / "sparse/split.txt").write_text("a/0001.png\n")
@@ -160,7 +159,7 @@ def test_a_scene_that_cannot_be_read_does_not_cost_the_others(make_scene_folder,
     out = tmp_path / "out"
     options = ("--layout", layout, "--figures", out)
     done = shell(tmp_path / "set", *options, "--format", "json")
-    assert done.returncode == 1
+    assert done.exit_code == 1
     place = folders[1] / "sparse/split.txt"
     begin, *wrote, line = done.stderr.splitlines()
     assert begin == "measure scenes: 0 of 3"
@@ -175,7 +174,7 @@ def test_a_scene_that_cannot_be_read_does_not_cost_the_others(make_scene_folder,
     for folder in folders:
         (folder / "sparse/split.txt").write_text("a/0001.png\n")
     done = shell(tmp_path / "set", *options)
-    assert (done.returncode, done.stdout) == (2, "")
+    assert (done.exit_code, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 4
 
 
