@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Mask
 from chronoscene.errors import BackendError, ConfigError
@@ -69,7 +70,7 @@ class Survey:
 
     def write_cloud(self, period: int, cloud: PointCloud) -> dict[str, Any]:
         """Write the points of a period; return the beginning of its summary."""
-        numbers = {
+        numbers: dict[str, NDArray[Any]] = {
             "period": np.full(len(cloud), period, np.uint16),
             "sigma": cloud.spread.astype(np.float32),
         }
@@ -113,11 +114,12 @@ class Survey:
         self, pair: tuple[int, int], clouds: Mapping[int, PointCloud], spacing: float, sigma: float
     ) -> dict[str, Any]:
         """Write the distances by M3C2 of two periods; return their summary."""
-        found = measure_distances(*(clouds[period] for period in pair), spacing, sigma)
+        first, second = (clouds[period] for period in pair)
+        found = measure_distances(first, second, spacing, sigma)
         if isinstance(found, str):
             return {"m3c2": None, "m3c2_absent": found}
         significant = np.abs(found.values) > found.level
-        numbers = {
+        numbers: dict[str, NDArray[Any]] = {
             "m3c2_distance": found.values.astype(np.float32),
             "level_of_detection": found.level.astype(np.float32),
             "slope": found.slope.astype(np.float32),
