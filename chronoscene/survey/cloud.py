@@ -57,12 +57,14 @@ class PointCloud:
 def dense_cloud(views: Sequence[DepthView], frame: MapFrame, grid: Grid) -> PointCloud:
     """Place the pixels of the training photos of a period at their depths, one in each cube with
     the edge of a cell; keep what several photos agree on."""
-    parts = [_points_of(view, frame, grid).thinned(grid.resolution) for view in views]
+    none = np.zeros((0, 3))
+    parts = [PointCloud(none, none.astype(np.uint8), none, np.zeros(0))]  # there may be no photos
+    parts += [_points_of(view, frame, grid).thinned(grid.resolution) for view in views]
     joined = [np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PointCloud)]
     cloud = PointCloud(*joined).thinned(grid.resolution)
     count, spread = look(frame.to_world(cloud.xyz), views, AGREE)
     whole = PointCloud(cloud.xyz, cloud.rgb, cloud.to_camera, spread)
-    return whole.select(count >= min(MIN_VIEWS, (len(views) + 1) // 2))
+    return whole.select(count >= min(MIN_VIEWS, max(2, len(views) // 2)))
 
 
 def _points_of(view: DepthView, frame: MapFrame, grid: Grid) -> PointCloud:

@@ -31,6 +31,14 @@ def test_points_lie_on_ground_roof_and_facades(scene):
     assert (cloud.to_camera[:, 2] > 30).all()
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_too_few_photos_give_no_points(scene, count):
+    frame = map_frame(scene, None)
+    views = list(depth_views(ToyRun(), scene, 1))[:count]
+    cloud = dense_cloud(views, frame, choose_grid(scene, frame, 0.25))
+    assert len(cloud) == 0 and cloud.rgb.dtype == np.uint8
+
+
 def test_sparse_points_of_a_period(scene):
     frame = map_frame(scene, None)
     both = [sparse_cloud(scene, period, frame) for period in (0, 1)]

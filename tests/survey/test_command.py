@@ -100,6 +100,32 @@ def test_a_scene_without_a_model_has_points_alone(tmp_path):
         assert f"{option}: expected a finished run" in str(again.exception)
 
 
+def test_distances_between_dense_sparse_points(tmp_path):
+    """The points of each period lie in a plane of their own, 0.5 m apart in a quarter of it."""
+    made = make_scene(tmp_path)
+    east, north = np.meshgrid(np.arange(40) / 4, np.arange(40) / 4)
+    planes = [np.stack([east, north, np.full_like(east, 0.0)], axis=-1).reshape(-1, 3)] * 2
+    planes[1] = planes[1] + [0, 0, 0.5] * ((planes[1] > 5)[:, :2].all(axis=1)[:, None])
+    count = len(planes[0])
+    points = replace(
+        made.points,
+        ids=np.arange(1, 2 * count + 1),
+        xyz=np.concatenate(planes) + np.random.default_rng(0).normal(0, 1e-3, (2 * count, 3)),
+        rgb=np.zeros((2 * count, 3), np.uint8),
+        error=np.zeros(2 * count),
+        track_start=2 * np.arange(2 * count + 1),
+        track_frame=np.repeat([0, 16], 2 * count).astype(np.int32) + np.tile([0, 5], 2 * count),
+        track_xy=np.ones((4 * count, 2)),
+    )
+    site = scene_format.write(replace(made, points=points), tmp_path / "s", image_source="none")
+    result = survey(site, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    read = laspy.read(tmp_path / "out/m3c2_0_1.laz")
+    moved = (read.x > 6) & (read.y > 6)
+    np.testing.assert_allclose(np.asarray(read["m3c2_distance"])[moved], 0.5, atol=0.01)
+    assert (np.asarray(read["significant"]) == 1)[moved].all() and not read["significant"][0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
