@@ -29,6 +29,8 @@ def draw_difference(
         difference: Between the periods.
         labels: Of the earlier and the later period.
     """
+    from matplotlib.ticker import MaxNLocator
+
     step = -(-max(grid.shape) // MAX_SIDE)
     edges = (
         grid.left, grid.left + grid.width * grid.resolution,
@@ -51,6 +53,7 @@ def draw_difference(
         )
         panel.set_title(title, fontsize=9)
         canvas.quiet_axes(panel)
+        panel.xaxis.set_major_locator(MaxNLocator(4))
         if options:
             bar = figure.colorbar(drawn, ax=panel, fraction=0.04, pad=0.02)
             bar.set_label("m", fontsize=8)

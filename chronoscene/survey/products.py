@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -206,7 +207,7 @@ def survey_run(
     for period in range(run.num_periods):
         report("survey", period, steps)
         views = list(depth_views(run, scene, period))
-        render = _renderer(run, period)
+        render = partial(run.render, period=period)
         surface = surfaces[period] = map_surface(render, views, work.frame, grid)
         clouds[period] = dense_cloud(views, work.frame, grid)
         work.write_period(period, grid, surface)
@@ -221,10 +222,6 @@ def survey_run(
         pairs.append({"periods": list(pair)} | made | distances)
     head = {"scene": scene.name, "run": run.record.label, "coordinates": work.coordinates()}
     return head | {"raster": asdict(grid), "periods": periods, "pairs": pairs}
-
-
-def _renderer(run: TrainedRun, period: int) -> Any:
-    return lambda camera, pose: run.render(camera, pose, period)
 
 
 def survey_scene(scene: Scene, folder: Path, options: SurveyOptions) -> dict[str, Any]:

@@ -113,7 +113,7 @@ def find_registration(
 
     By the certificate, it is the upper end of the 95 % interval of their displacement, over 1.96.
     Without one, it is what stable ground shows: the root of the squares of the median and of its
-    standard deviation.
+    standard deviation; 0 if there is no stable ground, either.
 
     Args:
         scene: Scene whose folder may hold a certificate.
@@ -128,7 +128,9 @@ def find_registration(
     limit = _certified(scene.root / CERTIFICATE, labels)
     if limit is not None:
         return Registration(limit / CONFIDENCE, f"{CERTIFICATE}, displacement of the pair")
-    mean = stable.nmad**2 * variance_of_mean(area, stable.length, stable.cells or 1)
+    if not stable.cells:
+        return Registration(0.0, f"unknown, and left out: there is no {CERTIFICATE} of this pair")
+    mean = stable.nmad**2 * variance_of_mean(area, stable.length, stable.cells)
     source = f"stable ground, as the scene has no {CERTIFICATE} of this pair"
     return Registration(float(np.sqrt(stable.median**2 + mean)), source)
 

@@ -133,6 +133,11 @@ def test_without_a_certificate_stable_ground_does(scene, made):
     assert found.source.startswith("stable ground")
 
 
+def test_nothing_says_how_well_periods_are_aligned(scene):
+    found = find_registration(scene, (0, 1), StableGround(0, 0.0, 0.0, 1.0, 1.0), 0.0)
+    assert found.sigma == 0 and found.source.startswith("unknown")
+
+
 @pytest.mark.parametrize("text", ['{"pairs": 3}', "{", '{"periods": [{}], "pairs": []}'])
 def test_a_damaged_certificate(scene, text):
     (scene.root / "registration.json").write_text(text)
