@@ -14,7 +14,7 @@ LAYERS = (
     ("chronogs", "baselines", "chronoscene.__main__"),
     ("chronoscene.cli",),
     ("chronoscene.api",),
-    ("leaderboard",),
+    ("leaderboard", "chronoscene.survey"),
     ("chronoscene.harness.study", "chronoscene.harness.contract", "chronoscene.harness.tune"),
     ("chronoscene.harness.run", "chronoscene.harness.train"),
     ("chronoscene.harness.report", "chronoscene.harness.use"),

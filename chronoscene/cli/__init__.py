@@ -37,6 +37,7 @@ COMMANDS = {
     "stats": "chronoscene.cli.scenes.stats:command",
     "study": "chronoscene.cli.runs.study:command",
     "submit": "chronoscene.cli.report.leaderboard:submit_command",
+    "survey": "chronoscene.cli.runs.survey:command",
     "synth": "chronoscene.cli.scenes.synth:command",
     "table": "chronoscene.cli.report.results:table",
     "tradeoff": "chronoscene.cli.report.tradeoff:command",

@@ -22,6 +22,7 @@ OPENING = (
     "leakage RUN",
     "page RUN --out OUT",
     "render RUN --out OUT",
+    "survey RUN --out OUT",
 )
 """Commands that need the model of a run."""
 READING = (

@@ -1,0 +1,1 @@
+"""Accuracy of the products of `chronoscene survey` on scenes whose truth is known."""

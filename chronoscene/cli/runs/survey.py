@@ -1,0 +1,134 @@
+"""``chronoscene survey``: maps, point clouds and differences of elevations of the periods."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE
+from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
+from chronoscene.cli.progress import announce, progress_bar
+from chronoscene.cli.runs.changes import usual_pairs
+from chronoscene.cli.scenes.reading import read_and_note
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import RUN_FILE
+from chronoscene.harness.use.trained_run import open_run
+from chronoscene.io.staging import check_outside, staged_folder
+from chronoscene.io.tables import Table, boxed_text, csv_text
+from chronoscene.scene import Scene
+from chronoscene.survey.products import SurveyOptions, check_packages, survey_run, survey_scene
+
+
+@click.command("survey")
+@click.argument("source", metavar="RUN|SCENE", type=FOLDER)
+@click.option("--out", type=FOLDER, required=True, help="New folder for the products.")
+@click.option(
+    "--between",
+    nargs=2,
+    multiple=True,
+    metavar="PERIOD PERIOD",
+    help="Compare these two periods (numbers or labels); may be repeated.  [default: all pairs of "
+    "up to 4 periods; of more, each with the next]",
+)
+@click.option(
+    "--resolution",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Edge of a cell in metres.  [default: a pixel of the training photos on the ground]",
+)
+@click.option("--area", type=EXISTING_FILE, help="GeoJSON file with polygons for volumes.")
+@click.option(
+    "--crs",
+    help="Projected reference system of the products, such as EPSG:32632.  [default: that of the "
+    "scene; of the local frame of register, UTM on WGS 84]",
+)
+@SCENE
+@PLUGIN
+@DEVICE
+def command(
+    source: Path,
+    out: Path,
+    between: tuple[tuple[str, str], ...],
+    resolution: float | None,
+    area: Path | None,
+    crs: str | None,
+    scene: Path | None,
+    device: str,
+    plugin: tuple[str, ...],
+) -> None:
+    """Make maps and differences of elevations.
+
+    RUN is the folder of a finished run, such as runs/plaza/chronogs-joint-balanced/seed0. For each
+    period, OUT gets an orthophoto and a surface model (GeoTIFF) and a point cloud (LAZ); for each
+    pair of periods the difference of elevations with its level of detection, volumes of cut and
+    fill, and distances by M3C2 (LAZ). Of a SCENE without a model, there are point clouds and
+    distances of its sparse points. docs/guides/survey.md explains the numbers.
+    """
+    check_packages()
+    check_place("--out", out)
+    is_run = scene is not None or (source / RUN_FILE).is_file()
+    run = open_run(source, device=device, plugin=plugin) if is_run else None
+    announce("read the scene")
+    found = read_and_note(source, None, None) if run is None else run.scene(scene)
+    check_outside(out, [found.root], option="--out")
+    pairs = tuple(_pair(found, *names) for names in between) or usual_pairs(found.num_periods)
+    options = SurveyOptions(tuple(pairs), resolution, area, crs)
+    with staged_folder(out) as staged, progress_bar() as report:
+        if run is None:
+            summary = survey_scene(found, staged, options)
+        else:
+            summary = survey_run(run, found, staged, options, report)
+            _write_volumes(staged / "volumes.csv", summary["pairs"])
+        text = json.dumps(summary, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        (staged / "survey.json").write_text(text, encoding="utf-8", newline="\n")
+    _print(summary)
+    report_written(out)
+
+
+def _pair(scene: Scene, *names: str) -> tuple[int, int]:
+    """Two periods in their order, by numbers or labels."""
+    known = {str(p.id): p.id for p in scene.periods} | {p.label: p.id for p in scene.periods}
+    first, second = sorted(known.get(name, -1) for name in names)
+    if first < 0 or first == second:
+        raise ConfigError(
+            f"--between {' '.join(names)}",
+            expected="two periods of the scene",
+            found="an unknown one" if first < 0 else "the same one twice",
+            todo=f"choose among {', '.join(f'{p.id} ({p.label})' for p in scene.periods)}",
+        )
+    return first, second
+
+
+def _write_volumes(path: Path, pairs: list[dict[str, Any]]) -> None:
+    rows = [dict(zip("ab", p["periods"], strict=True)) | v for p in pairs for v in p["volumes"]]
+    heads = list(rows[0]) if rows else []
+    path.write_text(csv_text(heads, [list(row.values()) for row in rows]), "utf-8", newline="\n")
+
+
+def _print(summary: Mapping[str, Any]) -> None:
+    labels = [period["label"] for period in summary["periods"]]
+    rows = []
+    for pair in summary["pairs"]:
+        name = " → ".join(labels[period] for period in pair["periods"])
+        for v in pair.get("volumes", ()):
+            volumes = (
+                f"{v[f'{kind}_m3']:,.0f} ± {v[f'{kind}_interval_m3']:,.0f}"
+                for kind in ("fill", "cut", "net")
+            )
+            rows.append((name, v["polygon"], f"{v['area_m2']:,.0f}", *volumes))
+        if pair["m3c2"] is None:
+            say(f"no M3C2 of {name}: {pair['m3c2_absent']}", fg="yellow")
+    if rows:
+        names = ("periods", "polygon", "area, m²", "fill, m³", "cut, m³", "net, m³")
+        title = "Volumes with their 95 % intervals"
+        table = Table([(name, "") for name in names], rows, labels=2, title=title)
+        emit(boxed_text(table, width=terminal_width(None)), None)
+    for period in summary["periods"]:
+        emit(f"period {period['label']}: {period['points']:,} points\n", None)
+    coordinates = summary["coordinates"]
+    emit(f"coordinates: {coordinates['note'] or coordinates['crs']}\n", None)
+    if "note" in summary:
+        say(f"note: {summary['note']}", fg="yellow")

@@ -1,0 +1,268 @@
+"""All products of a survey, written to a folder, and their summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.arrays import Array, Mask
+from chronoscene.errors import BackendError, ConfigError
+from chronoscene.harness.files.predictions import safe_part
+from chronoscene.harness.use.trained_run import TrainedRun
+from chronoscene.io.documents import read_json_document
+from chronoscene.io.processes import Report
+from chronoscene.scene import Scene
+from chronoscene.survey.cloud import PointCloud, dense_cloud, sparse_cloud
+from chronoscene.survey.difference import measure_volumes, subtract
+from chronoscene.survey.distances import measure_distances
+from chronoscene.survey.figure import draw_difference
+from chronoscene.survey.grid import Grid, choose_grid, natural_resolution
+from chronoscene.survey.laz import write_points
+from chronoscene.survey.map_frame import MapFrame, map_frame
+from chronoscene.survey.rasters import read_polygons, write_raster
+from chronoscene.survey.surface import Surface, map_surface
+from chronoscene.survey.uncertainty import CERTIFICATE, find_registration, stable_ground
+from chronoscene.survey.views import depth_views
+
+WHOLE = "whole area"
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyOptions:
+    """Products to make."""
+
+    pairs: tuple[tuple[int, int], ...]
+    """Periods to compare, the earlier first."""
+    resolution: float | None = None
+    """Metres; None for the natural one."""
+    area: Path | None = None
+    """GeoJSON file with the polygons of volumes."""
+    crs: str | None = None
+    """Reference system of the products."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """A survey at work: where it writes, and in which coordinates."""
+
+    folder: Path
+    scene: Scene
+    frame: MapFrame
+
+    def write_period(self, period: int, grid: Grid, surface: Surface) -> None:
+        """Write orthophoto and surface model of a period."""
+        known = np.where(np.isfinite(surface.heights), 255, 0).astype(np.uint8)
+        channels = zip(("red", "green", "blue"), np.moveaxis(surface.colors, 2, 0), strict=True)
+        picture = dict(channels) | {"alpha": known}
+        write_raster(self._path("orthophoto", period, "tif"), grid, self.frame, picture)
+        bands = {
+            "height, m": surface.heights,
+            "standard deviation of the height, m": surface.spread,
+            "photos that see the cell": surface.views,
+        }
+        write_raster(self._path("surface", period, "tif"), grid, self.frame, bands)
+
+    def write_cloud(self, period: int, cloud: PointCloud) -> dict[str, Any]:
+        """Write the points of a period; return the beginning of its summary."""
+        numbers: dict[str, NDArray[Any]] = {
+            "period": np.full(len(cloud), period, np.uint16),
+            "sigma": cloud.spread.astype(np.float32),
+        }
+        write_points(self._path("points", period, "laz"), cloud, self.frame, numbers)
+        label = self.scene.periods[period].label
+        return {"period": period, "label": label, "points": len(cloud)}
+
+    def _path(self, kind: str, period: int, suffix: str) -> Path:
+        label = self.scene.periods[period].label
+        name = kind if label == str(period) else f"{kind}_{safe_part(label)}"
+        return self.folder / f"{name}_{period}.{suffix}"
+
+    def compare_surfaces(
+        self, pair: tuple[int, int], grid: Grid, surfaces: Mapping[int, Surface],
+        polygons: Mapping[str, Mask],
+    ) -> dict[str, Any]:  # fmt: skip
+        """Write difference and picture of two periods; return their summary with the volumes."""
+        found = subtract(self.scene, grid, surfaces, pair)
+        known = np.isfinite(found.values)
+        name = "difference_{}_{}".format(*pair)
+        bands = {
+            "height of the later period minus the earlier, m": found.values,
+            "level of detection at 95 %, m": found.level,
+            "significant": np.where(known, found.significant, np.nan),
+        }
+        write_raster(self.folder / f"{name}.tif", grid, self.frame, bands)
+        first, second = (self.scene.periods[period].label for period in pair)
+        picture = self.folder / f"{name}.png"
+        draw_difference(picture, grid, surfaces[pair[1]], found, (first, second))
+        return {
+            "registration": asdict(found.registration),
+            "stable_ground": asdict(found.stable),
+            "level_of_detection": _median(found.level),
+            "changed_share": float(found.significant.sum() / max(known.sum(), 1)),
+            "volumes": [
+                asdict(measure_volumes(found, grid, *polygon)) for polygon in polygons.items()
+            ],
+        }
+
+    def compare_clouds(
+        self, pair: tuple[int, int], clouds: Mapping[int, PointCloud], spacing: float, sigma: float
+    ) -> dict[str, Any]:
+        """Write the distances by M3C2 of two periods; return their summary."""
+        first, second = (clouds[period] for period in pair)
+        found = measure_distances(first, second, spacing, sigma)
+        if isinstance(found, str):
+            return {"m3c2": None, "m3c2_absent": found}
+        significant = np.abs(found.values) > found.level
+        numbers: dict[str, NDArray[Any]] = {
+            "m3c2_distance": found.values.astype(np.float32),
+            "level_of_detection": found.level.astype(np.float32),
+            "slope": found.slope.astype(np.float32),
+            "significant": significant.astype(np.uint8),
+        }
+        path = self.folder / "m3c2_{}_{}.laz".format(*pair)
+        write_points(path, found.cores, self.frame, numbers)
+        return {
+            "m3c2": {
+                "core_points": len(significant),
+                "median": _median(found.values),
+                "level_of_detection": _median(found.level),
+                "changed_share": float(significant.mean()) if len(significant) else None,
+            }
+        }
+
+    def coordinates(self) -> dict[str, Any]:
+        """Describe coordinates and absolute position."""
+        frame, root = self.frame, self.scene.root
+        kind = _optional(root / "georeference.json").get("height_kind", "as stated")
+        return {
+            "crs": None if frame.is_local else frame.crs,
+            "note": "local metres: the scene has no georeference" if frame.is_local else None,
+            "heights": "local" if frame.is_local else f"{kind}; no geoid is applied",
+            "affine_map": {
+                "matrix": frame.matrix.tolist(),
+                "offset": frame.offset.tolist(),
+                "largest_error": frame.error,
+            },
+            "absolute_position": _optional(root / CERTIFICATE).get("absolute_position"),
+        }
+
+
+def check_packages() -> None:
+    """Check that the packages of the extra are installed.
+
+    Raises:
+        BackendError: If one is missing.
+    """
+    for name in ("laspy", "lazrs", "py4dgeo", "rasterio"):
+        if find_spec(name) is None:
+            raise BackendError(
+                "chronoscene survey",
+                expected=f"the package {name}",
+                found="none",
+                todo="pip install 'chronoscene[survey]'",
+            )
+
+
+def survey_run(
+    run: TrainedRun, scene: Scene, folder: Path, options: SurveyOptions, report: Report
+) -> dict[str, Any]:
+    """Make the products of a finished run.
+
+    Args:
+        run: The run.
+        scene: The scene that it was trained on.
+        folder: An existing folder.
+        options: Products to make.
+        report: Progress.
+
+    Returns:
+        The summary, for JSON.
+
+    Raises:
+        ConfigError: If an option does not fit, or the models do not know the periods.
+        SceneError: If the scene has no metres, or its certificate is damaged.
+    """
+    if options.pairs and not (run.uses_period or run.strategy.model_per_period):
+        raise ConfigError(
+            run.folder,
+            expected="a run whose models know the periods",
+            found=f"{run.spec.title} under strategy {run.record.strategy}",
+            todo="open one under strategy joint or separate",
+        )
+    work = Survey(folder, scene, map_frame(scene, options.crs))
+    resolution = options.resolution or natural_resolution(scene, run.record.max_width)
+    grid = choose_grid(scene, work.frame, resolution)
+    polygons = {WHOLE: np.ones(grid.shape, bool)}
+    polygons |= read_polygons(options.area, grid, work.frame) if options.area else {}
+    surfaces: dict[int, Surface] = {}
+    clouds: dict[int, PointCloud] = {}
+    periods, pairs, steps = [], [], run.num_periods + len(options.pairs)
+    for period in range(run.num_periods):
+        report("survey", period, steps)
+        views = list(depth_views(run, scene, period))
+        render = partial(run.render, period=period)
+        surface = surfaces[period] = map_surface(render, views, work.frame, grid)
+        clouds[period] = dense_cloud(views, work.frame, grid)
+        work.write_period(period, grid, surface)
+        known = float(np.isfinite(surface.heights).mean())
+        summary = {"known_share": known, "height_deviation": _median(surface.spread)}
+        periods.append(work.write_cloud(period, clouds[period]) | summary)
+    for number, pair in enumerate(options.pairs, run.num_periods):
+        report("survey", number, steps)
+        made = work.compare_surfaces(pair, grid, surfaces, polygons)
+        sigma = made["registration"]["sigma"]
+        distances = work.compare_clouds(pair, clouds, resolution, sigma)
+        pairs.append({"periods": list(pair)} | made | distances)
+    head = {"scene": scene.name, "run": run.record.label, "coordinates": work.coordinates()}
+    return head | {"raster": asdict(grid), "periods": periods, "pairs": pairs}
+
+
+def survey_scene(scene: Scene, folder: Path, options: SurveyOptions) -> dict[str, Any]:
+    """Make what a scene without a model has: its sparse points, and distances between those that
+    one period alone sees.
+
+    Arguments, result and errors as for `survey_run`.
+    """
+    for name in ("area", "resolution"):
+        if getattr(options, name) is not None:
+            raise ConfigError(
+                f"--{name}",
+                expected="a finished run, as rasters need a model",
+                found=f"the scene {scene.root}",
+                todo="name the folder of a run, or leave it out",
+            )
+    work = Survey(folder, scene, map_frame(scene, options.crs))
+    clouds = {p.id: sparse_cloud(scene, p.id, work.frame) for p in scene.periods}
+    periods, pairs = [work.write_cloud(*item) for item in clouds.items()], []
+    for pair in options.pairs:
+        alone = {p: sparse_cloud(scene, p, work.frame, alone=True) for p in pair}
+        registration = find_registration(scene, pair, stable_ground(np.zeros(0), np.zeros(0), 1), 1)
+        spacing = _spacing(alone[pair[0]].xyz)
+        made = work.compare_clouds(pair, alone, spacing, registration.sigma)
+        pairs.append({"periods": list(pair), "registration": asdict(registration)} | made)
+    head = {"scene": scene.name, "run": None, "coordinates": work.coordinates()}
+    note = "no rasters and volumes: these need a finished run"
+    return head | {"periods": periods, "pairs": pairs, "note": note}
+
+
+def _spacing(xyz: Array) -> float:
+    """Median distance of points to their nearest other; 1 without any."""
+    from scipy.spatial import cKDTree
+
+    return float(np.median(cKDTree(xyz).query(xyz, 2)[0][:, 1])) if len(xyz) > 1 else 1.0
+
+
+def _optional(path: Path) -> dict[str, Any]:
+    return dict(read_json_document(path)) if path.is_file() else {}
+
+
+def _median(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None

@@ -1,0 +1,109 @@
+"""Rasters as GeoTIFF, and polygons of GeoJSON as cells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.arrays import Mask
+from chronoscene.errors import ConfigError
+from chronoscene.io.documents import read_json_document
+from chronoscene.survey.grid import Grid
+from chronoscene.survey.map_frame import MapFrame
+
+NODATA = -9999.0
+
+
+def write_raster(
+    path: Path, grid: Grid, frame: MapFrame, bands: Mapping[str, NDArray[Any]]
+) -> None:
+    """Write a GeoTIFF: four bands of bytes as a picture with transparency, others as float32 with
+    `NODATA` for NaN.
+
+    Args:
+        path: The file.
+        grid: Its cells.
+        frame: Its reference system.
+        bands: By their descriptions, of one type. [H, W] each
+    """
+    from rasterio.io import MemoryFile
+
+    data = np.stack(list(bands.values()))
+    options: dict[str, Any] = {"photometric": "RGB", "alpha": "yes", "predictor": 2}
+    if data.dtype != np.uint8:
+        data = np.where(np.isfinite(data), data, NODATA).astype(np.float32)
+        options = {"nodata": NODATA, "predictor": 3}
+    with MemoryFile() as memory:
+        with memory.open(
+            driver="GTiff", width=grid.width, height=grid.height, count=len(data),
+            dtype=data.dtype, crs=frame.crs, transform=_transform(grid), compress="deflate",
+            tiled=True, **options,
+        ) as file:  # fmt: skip
+            file.write(data)
+            file.descriptions = tuple(bands)
+        path.write_bytes(memory.getbuffer())  # GDAL itself does not report a full disk
+
+
+def _transform(grid: Grid) -> Any:
+    from rasterio import Affine
+
+    return Affine(grid.resolution, 0, grid.left, 0, -grid.resolution, grid.top)
+
+
+def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Mask]:
+    """Read the polygons of a GeoJSON file as the cells [H, W] whose centres are inside.
+
+    Coordinates are in the system of its member ``crs`` if it has one; else longitude and latitude
+    if they can be, and map coordinates otherwise. Names are the property ``name``, or numbers.
+
+    Raises:
+        ConfigError: If the file is damaged, has other geometries, or lies outside the map.
+    """
+    from rasterio.features import geometry_mask
+
+    data = read_json_document(path, error=ConfigError)
+    features = data.get("features", [data])
+    named: dict[str, Mask] = {}
+    for number, feature in enumerate(features if isinstance(features, list) else (), 1):
+        place = f"--area {path}, feature {number}"
+        shape = _on_map(place, data.get("crs"), feature, frame)
+        cells = geometry_mask([shape], grid.shape, _transform(grid), invert=True)
+        if not cells.any():
+            raise _wrong(place, "a polygon on the map", "one outside", "check its coordinates")
+        name = str((feature.get("properties") or {}).get("name", number))
+        named[name if name not in named else f"{name} ({number})"] = cells
+    if not named:
+        raise _wrong(f"--area {path}", "polygons", "none", "draw at least one")
+    return named
+
+
+def _on_map(place: str, system: Any, feature: Any, frame: MapFrame) -> Any:
+    """Geometry of a feature in map coordinates."""
+    from rasterio.errors import CRSError
+    from rasterio.features import bounds, is_valid_geom
+    from rasterio.warp import transform_geom
+
+    shape = feature.get("geometry", feature) if isinstance(feature, dict) else {}
+    polygon = isinstance(shape, dict) and shape.get("type") in ("Polygon", "MultiPolygon")
+    if not polygon or not is_valid_geom(shape):
+        raise _wrong(place, "a polygon of GeoJSON", "none", "draw areas as polygons")
+    left, bottom, right, top = bounds(shape)
+    angles = max(-left, right) <= 180 and max(-bottom, top) <= 90
+    crs = "OGC:CRS84" if angles and not frame.is_local else None
+    try:
+        if system is not None:
+            crs = system["properties"]["name"]
+            if frame.is_local:
+                raise KeyError
+        return shape if crs is None else transform_geom(crs, frame.crs, shape)
+    except (CRSError, KeyError, TypeError, ValueError) as error:
+        wanted = "no crs, as the scene has none" if frame.is_local else "a known crs"
+        raise _wrong(place, wanted, repr(system)[:80], "convert the polygons") from error
+
+
+def _wrong(place: str, expected: str, found: str, todo: str) -> ConfigError:
+    return ConfigError(place, expected=expected, found=found, todo=todo)

@@ -1,0 +1,136 @@
+"""Files, read back with rasterio and laspy."""
+
+import json
+
+import laspy
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+
+from chronoscene.errors import ConfigError
+from chronoscene.survey.cloud import PointCloud
+from chronoscene.survey.grid import Grid
+from chronoscene.survey.laz import write_points
+from chronoscene.survey.map_frame import LOCAL, MapFrame
+from chronoscene.survey.rasters import NODATA, read_polygons, write_raster
+
+UTM = MapFrame("EPSG:32632", np.eye(3), np.zeros(3), 0.0)
+HERE = MapFrame(LOCAL, np.eye(3), np.zeros(3), 0.0)
+GRID = Grid(680_000.0, 5_152_000.0, 0.5, 40, 30, 0.0, 10.0)
+
+
+@pytest.mark.parametrize("frame", [UTM, HERE])
+def test_a_raster_of_heights(tmp_path, frame):
+    heights = np.arange(1200.0).reshape(30, 40)
+    heights[3, 5] = np.nan
+    bands = {"height": heights, "views": np.full((30, 40), 7)}
+    write_raster(tmp_path / "a.tif", GRID, frame, bands)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        read = file.read(1, masked=True)
+        assert file.nodata == NODATA and read.mask.sum() == 1 and read.mask[3, 5]
+        assert file.descriptions == ("height", "views") and (file.read(2) == 7).all()
+        assert file.index(680_000.75, 5_151_999.25) == (1, 1) and file.res == (0.5, 0.5)
+        assert next(file.sample([(680_003.1, 5_151_998.4)]))[0] == heights[3, 6]
+        if frame is UTM:
+            assert file.crs.to_epsg() == 32632
+        else:
+            assert "local metres" in file.crs.to_wkt() and not file.crs.is_projected
+
+
+def test_a_picture_is_transparent_where_nothing_is_known(tmp_path):
+    bands = {name: np.full((30, 40), i, np.uint8) for i, name in enumerate("rgb")}
+    bands["alpha"] = np.eye(30, 40, dtype=np.uint8) * 255
+    write_raster(tmp_path / "a.tif", GRID, UTM, bands)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        assert [c.name for c in file.colorinterp] == ["red", "green", "blue", "alpha"]
+        np.testing.assert_array_equal(file.dataset_mask(), bands["alpha"])
+
+
+@pytest.mark.parametrize("frame", [UTM, HERE])
+def test_a_cloud(tmp_path, frame):
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(-50, 50, (500, 3)) + np.array([680_000, 5_152_000, 300])
+    rgb = rng.integers(0, 256, (500, 3), dtype=np.uint8)
+    cloud = PointCloud(xyz, rgb, xyz, np.full(500, np.nan))
+    numbers = {"period": np.full(500, 2, np.uint16), "sigma": rng.random(500, np.float32)}
+    write_points(tmp_path / "a.laz", cloud, frame, numbers)
+    read = laspy.read(tmp_path / "a.laz")
+    assert read.header.are_points_compressed and read.header.point_format.id == 7
+    np.testing.assert_allclose(read.xyz, xyz, atol=0.00051)
+    np.testing.assert_array_equal(np.stack([read.red, read.green, read.blue], axis=1) // 256, rgb)
+    np.testing.assert_array_equal(read["period"], 2)
+    np.testing.assert_array_equal(read["sigma"], numbers["sigma"])
+    assert read["period"].dtype == np.uint16 and read["sigma"].dtype == np.float32
+    crs = read.header.parse_crs()
+    assert crs.to_epsg() == 32632 if frame is UTM else crs.name == "local metres"
+
+
+def test_a_cloud_without_points(tmp_path):
+    nothing = PointCloud(
+        np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)), np.zeros(0)
+    )
+    write_points(tmp_path / "a.laz", nothing, HERE, {"period": np.zeros(0, np.uint16)})
+    assert len(laspy.read(tmp_path / "a.laz")) == 0
+
+
+SQUARE = np.array([[2, 2], [7, 2], [7, 5], [2, 5], [2, 2]]) + np.array([680_000.0, 5_151_990.0])
+
+
+def geojson(ring, crs=None, **properties):
+    shape = {"type": "Polygon", "coordinates": [np.asarray(ring).tolist()]}
+    feature = {"type": "Feature", "properties": properties or None, "geometry": shape}
+    named = {"crs": {"type": "name", "properties": {"name": crs}}} if crs else {}
+    return {"type": "FeatureCollection", "features": [feature]} | named
+
+
+def read(tmp_path, data, frame=UTM, grid=GRID):
+    path = tmp_path / "area.geojson"
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
+    return read_polygons(path, grid, frame)
+
+
+def test_polygons_in_each_system(tmp_path):
+    to = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
+    degrees = np.column_stack(to.transform(*SQUARE.T))
+    to = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:32633", always_xy=True)
+    other = np.column_stack(to.transform(*SQUARE.T))
+    cells = np.zeros(GRID.shape, bool)
+    cells[10:16, 4:14] = True
+    for data in (
+        geojson(SQUARE, name="pit"),
+        geojson(degrees, name="pit"),
+        geojson(other, "urn:ogc:def:crs:EPSG::32633", name="pit"),
+    ):
+        made = read(tmp_path, data)
+        assert list(made) == ["pit"]
+        np.testing.assert_array_equal(made["pit"], cells)
+    near = Grid(0.0, 10.0, 0.5, 40, 30, 0.0, 10.0)
+    local = read(tmp_path, geojson(SQUARE - [680_000, 5_151_990])["features"][0], HERE, near)
+    np.testing.assert_array_equal(local["1"], cells)
+
+
+def test_equal_names_stay_apart(tmp_path):
+    data = geojson(SQUARE, name="pit")
+    data["features"] *= 2
+    assert list(read(tmp_path, data)) == ["pit", "pit (2)"]
+
+
+@pytest.mark.parametrize(
+    ("data", "frame", "message"),
+    [
+        ("{", UTM, "expected JSON"),
+        ({"type": "FeatureCollection", "features": []}, UTM, "expected polygons, found none"),
+        ({"features": 3}, UTM, "expected polygons, found none"),
+        ({"features": [3]}, UTM, "feature 1: expected a polygon"),
+        ({"type": "Point", "coordinates": [0, 0]}, UTM, "expected a polygon"),
+        ({"type": "Polygon", "coordinates": [[[0, 0], ["x", 1]]]}, UTM, "expected a polygon"),
+        (geojson(SQUARE + 1e4), UTM, "on the map, found one outside"),
+        (geojson(SQUARE, "EPSG:nonsense"), UTM, "a known crs"),
+        (geojson(SQUARE, "EPSG:32632"), HERE, "no crs, as the scene has none"),
+        (geojson(SQUARE) | {"crs": 3}, UTM, "a known crs"),
+    ],
+)
+def test_bad_polygons(tmp_path, data, frame, message):
+    with pytest.raises(ConfigError, match=message):
+        read(tmp_path, data, frame)

@@ -1,0 +1,113 @@
+"""Maps of a scene whose heights are known."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from surveyed import CAMERA, HIGH, LOW, ROOF, ToyRun, render
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.use.cameras import Viewpoint
+from chronoscene.methods import Prediction
+from chronoscene.survey.grid import choose_grid, natural_resolution
+from chronoscene.survey.map_frame import map_frame
+from chronoscene.survey.surface import TILE, camera_above, map_surface
+from chronoscene.survey.views import DepthView, depth_views, look, solid_depth
+
+
+def surface_of(scene, period, resolution=0.5, views=None, noise=0.0):
+    frame = map_frame(scene, None)
+    grid = choose_grid(scene, frame, resolution)
+    if views is None:
+        views = list(depth_views(ToyRun(noise=noise), scene, period))
+    return grid, map_surface(partial(render, period=period, noise=noise), views, frame, grid)
+
+
+def on_roof(grid):
+    east, north = np.moveaxis(grid.centres, 2, 0)
+    return (east > LOW[0]) & (east < HIGH[0]) & (north > LOW[1]) & (north < HIGH[1])
+
+
+@pytest.mark.parametrize("resolution", [0.5, 0.1])
+def test_each_cell_has_the_height_at_its_centre(scene, resolution):
+    grid, surface = surface_of(scene, 1, resolution)
+    assert max(grid.shape) > TILE or resolution == 0.5
+    roof = on_roof(grid)
+    assert roof.sum() == round(20 / resolution**2)
+    np.testing.assert_allclose(surface.heights[roof], 3.0, atol=1e-3)
+    known = np.isfinite(surface.heights)
+    np.testing.assert_allclose(surface.heights[known & ~roof], 0.0, atol=1e-3)
+    assert known.mean() > 0.9
+    assert (surface.colors[roof] == np.round(ROOF * 255)).all()
+
+
+def test_edges_are_multiples_of_the_resolution_around_the_points(scene):
+    grid = choose_grid(scene, map_frame(scene, None), 0.5)
+    assert (grid.left, grid.top, grid.width, grid.height) == (-9.0, 7.0, 36, 28)
+    np.testing.assert_allclose(grid.centres[0, 0], [-8.75, 6.75])
+
+
+def test_natural_resolution_is_that_of_a_pixel(scene):
+    assert natural_resolution(scene, 1600) == pytest.approx(40 / 80, rel=0.05)
+    assert natural_resolution(scene, 48) == pytest.approx(2 * natural_resolution(scene, 1600), 0.05)
+
+
+def test_places_that_one_photo_sees_are_unknown(scene):
+    views = list(depth_views(ToyRun(), scene, 0))
+    assert np.isnan(surface_of(scene, 0, views=views[:1])[1].heights).all()
+    surface = surface_of(scene, 0, views=views[:2])[1]
+    assert (np.isfinite(surface.heights) == (surface.views == 2)).all()
+
+
+def test_what_no_camera_sees_is_unknown(scene):
+    """The photos of period 1 see no box: what the model shows there is seen by none."""
+    views = list(depth_views(ToyRun(), scene, 0))
+    grid, surface = surface_of(scene, 1, views=views)
+    assert np.isnan(surface.heights[on_roof(grid)]).all()
+
+
+def test_the_spread_is_the_standard_deviation_of_the_depths(scene):
+    (view,) = list(depth_views(ToyRun(), scene, 0))[:1]
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    down[2, 3] = 40.0
+    rng = np.random.default_rng(0)
+    views = [
+        DepthView(Viewpoint("", CAMERA, down, 0), np.full_like(view.depth, 40 + error), view.rgb)
+        for error in rng.normal(0, 0.2, 400)
+    ]
+    places = np.column_stack([rng.uniform(-5, 5, (2000, 2)), np.zeros(2000)])
+    count, spread = look(places, views, 0.05, up=np.array([0.0, 0.0, 1.0]))
+    assert (count == 400).all()
+    assert spread.mean() == pytest.approx(0.2, rel=0.1)
+    assert np.isnan(look(places + 1000, views, 0.05)[1]).all()
+
+
+def test_the_camera_is_far_enough_and_not_too_far(scene):
+    frame = map_frame(scene, None)
+    grid = choose_grid(scene, frame, 0.1)
+    rows, columns = next(grid.tiles(TILE))
+    camera, pose, altitude = camera_above(frame, grid, rows, columns)
+    top = np.array([grid.left, grid.top, grid.high, 1.0])
+    x, y, z = (pose @ top)[:3]
+    at = camera.K @ np.array([x / z, y / z, 1])
+    assert np.abs(at[:2]).max() == pytest.approx(0.1 / np.sqrt(2), rel=0.01)  # of a cell
+    assert altitude * 2.0**-24 < 1e-4 * (grid.high - grid.low) / 2
+
+
+def test_transparent_places_are_no_surface():
+    depth = np.full((2, 2), 5.0, np.float32)
+    alpha = np.array([[1, 0.5], [0.49, 0]], np.float32)
+    found = solid_depth(Prediction(np.zeros((2, 2, 3), np.float32), alpha, depth))
+    np.testing.assert_array_equal(found, [[5, 5], [np.inf, np.inf]])
+
+
+def test_a_method_without_depth_is_refused():
+    with pytest.raises(ConfigError, match="renders depth"):
+        solid_depth(Prediction(np.zeros((2, 2, 3), np.float32)))
+
+
+def test_too_many_cells(scene):
+    with pytest.raises(ConfigError, match=r"at most 20,000,000 cells.*choose 0\.00") as raised:
+        choose_grid(scene, map_frame(scene, None), 1e-3)
+    advised = float(str(raised.value).split("choose ")[1].split()[0])
+    choose_grid(scene, map_frame(scene, None), advised)
