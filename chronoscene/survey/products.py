@@ -81,7 +81,8 @@ class Survey:
 
     def _path(self, kind: str, period: int, suffix: str) -> Path:
         label = self.scene.periods[period].label
-        name = kind if label == str(period) else f"{kind}_{safe_part(label)}"
+        shown = safe_part(label).replace(" ", "-")
+        name = kind if label == str(period) else f"{kind}_{shown}"
         return self.folder / f"{name}_{period}.{suffix}"
 
     def compare_surfaces(
