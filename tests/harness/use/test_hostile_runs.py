@@ -22,6 +22,7 @@ OPENING = (
     "leakage RUN",
     "page RUN --out OUT",
     "render RUN --out OUT",
+    "view RUN",
 )
 """Commands that need the model of a run."""
 READING = (
