@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MAX_POINTS, MAX_CAMERAS = 300_000, 300
 """Points of a scene, and cameras of a period, that a browser gets: a choice that is the same for
 equal scenes."""
-FRUSTUM = 0.2  # Length of a drawn frustum in mean distances between neighbouring cameras
+FRUSTUM = 0.12  # Length of a drawn frustum in mean distances between neighbouring cameras
 POINT, PLACE = 0.003 * EXTENT, 0.004 * EXTENT  # Edges of points, and of places of a change map
 TEST, TRAIN = (255, 193, 36), (76, 134, 255)  # Colours of frusta
 CHANGED = (2, 3, 4)  # Classes of a change map that are drawn
@@ -103,7 +103,6 @@ class Layers:
             fov=vertical_fov(frame),
             aspect=frame.camera.width / frame.camera.height,
             scale=scale,
-            thickness=0.02 * scale,
             color=TEST if frame.split == "test" else TRAIN,
             wxyz=quaternion_from_rotation(pose[:3, :3].T),
             position=camera_centre(pose),

@@ -115,7 +115,7 @@ class Viewer:
     def _add_path(self) -> None:
         gui = self._client.gui
         with gui.add_folder("Camera path", expand_by_default=False):
-            self._count = gui.add_markdown("No views yet.")
+            self._count = gui.add_markdown("No views yet")
             add, drop = gui.add_button("Add this view"), gui.add_button("Remove the last view")
             self._seconds = gui.add_slider("Seconds", 1.0, 60.0, 0.5, 8.0)
             self._save = gui.add_button("Save for render", visible=False)
@@ -125,7 +125,7 @@ class Viewer:
 
     def _keep(self, views: list[KeyView]) -> None:
         self._views, self._save.visible = views, bool(views)
-        self._count.content = f"{len(views)} views, each with its period."
+        self._count.content = f"Views, each with its period: {len(views)}"
 
     def _send_path(self) -> None:
         whole = not all(run.is_continuous for run in self._content.runs)

@@ -63,7 +63,7 @@ def draw_picture(
     rgb = np.concatenate([each.rgb for each in shown], axis=1)
     if 0 < cut < width:
         rgb[:, cut - max(1, width // 500) : cut] = 1
-    return rgb, np.concatenate([_depth(each) for each in shown], axis=1)
+    return rgb, np.concatenate([surface_depth(each) for each in shown], axis=1)
 
 
 def color_depth(depth: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -87,19 +87,14 @@ def neighbours(run: TrainedRun, period: float) -> list[tuple[float, float]]:
 
 
 def _draw_side(side: Side, camera: Camera, pose: Array) -> Prediction:
-    """Fade between finished pictures; the depth is that of the picture with the most weight."""
+    """Fade between finished pictures; the depth is that of the one with the most weight."""
     colors = [(None, 1.0)] if side.appearance is None else neighbours(side.run, side.appearance)
-    rgb, depth, most = np.zeros((camera.height, camera.width, 3), np.float32), None, 0.0
+    rgb = np.zeros((camera.height, camera.width, 3), np.float32)
+    depth, most = np.zeros(rgb.shape[:2], np.float32), 0.0
     for period, share in neighbours(side.run, side.period):
         for appearance, other in colors:
             shown = side.run.render(camera, pose, period, appearance_period=appearance)
             rgb += share * other * shown.rgb
-            if share * other > most:
+            if shown.depth is not None and share * other > most:
                 depth, most = shown.depth, share * other
     return Prediction(rgb=rgb, depth=depth)
-
-
-def _depth(prediction: Prediction) -> NDArray[np.float64]:
-    if prediction.depth is None:
-        return np.full(prediction.rgb.shape[:2], np.inf)
-    return surface_depth(prediction)

@@ -13,9 +13,8 @@ import time
 from collections.abc import Callable, Hashable
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, field
-from typing import TypeVar
 
-T = TypeVar("T")
+from chronoscene.methods import Prediction
 
 UPDATES = 20
 """Pictures a second while something moves."""
@@ -48,11 +47,11 @@ class Resolution:
 class _Seat:
     """State of a viewer. All times are in seconds."""
 
+    draw: Draw
+    """The newest request."""
     resolution: Resolution = field(default_factory=Resolution)
     served: float = -math.inf
     """Time of the last picture."""
-    draw: Draw | None = None
-    """The newest request."""
     full: int = 0
     """Pixels of its complete picture."""
     drawn: int = 0
@@ -76,7 +75,7 @@ class RenderWorker:
     def request(self, key: Hashable, draw: Draw, size: tuple[int, int]) -> None:
         """Replace what a viewer asked for; ``size`` is that of the complete picture."""
         with self._changed:
-            seat = self._seats.setdefault(key, _Seat())
+            seat = self._seats.setdefault(key, _Seat(draw))
             seat.draw, seat.full, seat.drawn = draw, min(size[0] * size[1], FULL), 0
             seat.asked = seat.due = time.monotonic()
             self._changed.notify()
@@ -86,8 +85,8 @@ class RenderWorker:
         with self._changed:
             self._seats.pop(key, None)
 
-    def between(self, function: Callable[[], T]) -> T:
-        """Call a function in this thread while no picture is drawn.
+    def between(self, render: Callable[[], Prediction]) -> Prediction:
+        """Render for another purpose, in the calling thread, while no picture is drawn.
 
         Raises:
             CancelledError: If the worker was stopped.
@@ -96,7 +95,7 @@ class RenderWorker:
         with self._drawing:
             if self._stopped:
                 raise CancelledError
-            return function()
+            return render()
 
     def stop(self) -> None:
         """End the thread after the picture that is being drawn."""
@@ -127,7 +126,6 @@ class RenderWorker:
             seat.served, seat.due = time.monotonic(), math.inf
         pixels = min(GROWTH * drawn if drawn else int(seat.resolution.pixels), full)
         with self._drawing:
-            assert draw is not None
             draw(pixels)
         with self._changed:
             if not drawn:

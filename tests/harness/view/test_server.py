@@ -27,7 +27,7 @@ from chronoscene.harness.view.server import PORT, ViewServer, choose_port, tunne
 from chronoscene.harness.view.summary import certificate_summary
 
 pytest.importorskip("viser", reason="viser is not installed")
-from viewer_browser import Browser
+from benchmarks.viewer.browser import Browser
 
 
 @pytest.fixture

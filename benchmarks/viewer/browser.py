@@ -29,14 +29,14 @@ class Browser:
     def send(self, kind: str, **fields: Any) -> None:
         self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
-    def look(self, position, wxyz=(1.0, 0.0, 0.0, 0.0)) -> None:
+    def look(self, position: Any, wxyz: Any = (1.0, 0.0, 0.0, 0.0), fov: float = 1.0) -> None:
         """Report a camera, which viser expects before anything else."""
         position = [float(x) for x in position]
         self.send(
             "ViewerCameraMessage",
             wxyz=[float(x) for x in wxyz],
             position=position,
-            fov=1.0,
+            fov=float(fov),
             near=0.01,
             far=1000.0,
             image_width=self.size[0],
