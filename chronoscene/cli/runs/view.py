@@ -47,6 +47,7 @@ def command(
     RUN is the folder of a run, such as runs/plaza/chronogs-joint-balanced/seed0; two or more runs
     of a scene are compared. SCENE is a dataset, or what register wrote. Ctrl-C ends the viewer.
     """
+    chosen = choose_port(host, port)
     if any((folder / RUN_FILE).is_file() for folder in folders):
         runs = [open_run(folder, device=device, plugin=plugin) for folder in folders]
         check_runs(runs)
@@ -66,7 +67,7 @@ def command(
     else:
         found = read_and_note(folders[0], dataset_format, period_by)
         content = Content(found, summary=certificate_summary(folders[0]))
-    server = ViewServer(content, host, choose_port(host, port))
+    server = ViewServer(content, host, chosen)
     try:
         _report(host, server.port, port or PORT)
         threading.Event().wait()

@@ -103,6 +103,7 @@ class Layers:
             fov=vertical_fov(frame),
             aspect=frame.camera.width / frame.camera.height,
             scale=scale,
+            thickness=0.02 * scale,
             color=TEST if frame.split == "test" else TRAIN,
             wxyz=quaternion_from_rotation(pose[:3, :3].T),
             position=camera_centre(pose),

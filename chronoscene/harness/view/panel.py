@@ -14,6 +14,7 @@ from chronoscene.harness.view.content import Content, vertical_fov
 from chronoscene.harness.view.layers import ALL, Layers
 from chronoscene.harness.view.paths import KeyView, path_file
 from chronoscene.harness.view.pictures import Side, color_depth, draw_picture
+from chronoscene.harness.view.summary import literal
 from chronoscene.harness.view.worker import FULL, RenderWorker
 from chronoscene.scene import Frame
 from chronoscene.scene.geometry import (
@@ -40,21 +41,23 @@ class Viewer:
     def __init__(
         self, client: viser.ClientHandle, content: Content, worker: RenderWorker | None
     ) -> None:
-        """Make the panel and ask for the first picture; ``worker`` draws runs, if there are any."""
+        """Make the panel; ``worker`` draws the runs, if there are any."""
         self._client, self._content, self._worker = client, content, worker
         self._labels, self._closed = list(content.cloud.labels), False
+        if len(set(self._labels)) < len(self._labels):
+            self._labels = [f"{i}: {label}" for i, label in enumerate(self._labels)]
         self._layers = Layers(client, content, self._visit)
         self._views: list[KeyView] = []
         self._compared: tuple[int, list[int]] | None = None
+        self._refused = ""
         self._asking = threading.Lock()
         if content.summary:
             client.gui.add_markdown(content.summary)
         controls = [*self._add_picture(), *self._add_split(), *self._add_changes()]
         for control in [*controls, *self._add_scene()]:
-            control.on_update(lambda _: self._update())
+            control.on_update(lambda _: self.update())
         self._add_path()
         client.camera.on_update(lambda _: self._ask())
-        self._update()
 
     def close(self) -> None:
         """End what goes on in the background after the browser has left."""
@@ -133,7 +136,7 @@ class Viewer:
         data = path_file(self._views, *shape, whole=whole)
         self._client.send_file_download("camera_path.json", data, save_immediately=True)
 
-    def _update(self) -> None:
+    def update(self) -> None:
         """Show what the panel says."""
         if self._closed:
             return
@@ -142,7 +145,7 @@ class Viewer:
         label = self._labels[low]
         if share := round(100 * (period - low)):
             label = f"{100 - share} % {label}, {share} % {self._labels[low + 1]}"
-        self._label.content = f"**{label}**"
+        self._label.content = f"**{literal(label)}**"
         self._colors.visible = self._recolored.value
         self._wipe.visible = self._right.visible = self._split.value
         self._other.visible = self._split.value and len(self._names) > 1
@@ -179,8 +182,11 @@ class Viewer:
         try:
             rgb, depth = draw_picture(view, size, sides, pixels, float(self._wipe.value))
         except Exception as error:  # the other viewers go on
-            self._notify(error)
+            if str(error) != self._refused:  # once, not for each picture
+                self._notify(error)
+            self._refused = str(error)
             return
+        self._refused = ""
         objects = self._points.value != POINTS[0] or self._cameras.value or self._changes.value
         scale = self._content.view_from_world.scale * (BEHIND if self._changes.value else 1)
         if not self._closed:

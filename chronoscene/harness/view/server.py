@@ -36,7 +36,7 @@ def choose_port(host: str, port: int | None) -> int:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             socket.create_server((host, number), family=family).close()
         except OSError as error:
-            place, found = f"{host}:{number}", error.strerror or str(error)
+            place, found = f"{host}:{number}", str(error.strerror).partition(" (")[0]
             if error.errno != errno.EADDRINUSE:
                 break
         else:
@@ -111,6 +111,7 @@ class ViewServer:
             self.viewers[client.client_id] = viewer
         if client.client_id not in self._server.get_clients():  # has left already
             self._leave(client)
+        viewer.update()
 
     def _leave(self, client: viser.ClientHandle) -> None:
         with self._lock:

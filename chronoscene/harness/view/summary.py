@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,11 @@ from typing import Any
 from chronoscene.io.documents import json_error, read_json_document
 from chronoscene.registration.output import CERTIFICATE
 from chronoscene.registration.report.certificate_json import Figure
+
+
+def literal(text: object) -> str:
+    """Return text that Markdown shows as it is: viser would run scripts in it."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(str(text).split()))
 
 
 def certificate_summary(folder: Path) -> str:
@@ -27,10 +33,12 @@ def certificate_summary(folder: Path) -> str:
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:
     for key, name in (("alignment", "Alignment"), ("absolute_position", "Absolute position")):
-        yield f"**{name}: {document[key]['verdict']}.** {document[key]['text']}"
+        judged = document[key]
+        yield f"**{name}: {literal(judged['verdict'])}\\.** {literal(judged['text'])}"
     labels = {period["period"]: period["label"] for period in document["periods"]}
     for pair in document["pairs"]:
-        yield f"**{' and '.join(labels[p] for p in pair['periods'])}: {pair['verdict']}**"
+        names = " and ".join(literal(labels[period]) for period in pair["periods"])
+        yield f"**{names}: {literal(pair['verdict'])}**"
         for figure in (Figure(**values) for values in pair["figures"]):
             if figure.name.startswith("held-out reprojection error"):
-                yield f"{figure.name}: {figure.text}"
+                yield literal(f"{figure.name}: {figure.text}")

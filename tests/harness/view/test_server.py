@@ -10,6 +10,7 @@ import sys
 import time
 import warnings
 from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from PIL import Image
 
 from chronoscene.cli import cli
 from chronoscene.errors import ChronoSceneError, ConfigError
+from chronoscene.formats import read_scene
 from chronoscene.harness.use.cameras import find_viewpoints
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.harness.view import server as server_module
@@ -25,6 +27,7 @@ from chronoscene.harness.view.content import Content
 from chronoscene.harness.view.panel import POINTS
 from chronoscene.harness.view.server import PORT, ViewServer, choose_port, tunnel_command
 from chronoscene.harness.view.summary import certificate_summary
+from chronoscene.scene import Period
 
 pytest.importorskip("viser", reason="viser is not installed")
 from benchmarks.viewer.browser import Browser
@@ -212,8 +215,6 @@ def test_an_error_is_shown_and_the_viewer_goes_on(trained, serve, monkeypatch):
 
 
 def test_a_scene_has_points_and_cameras(scene_folder, serve):
-    from chronoscene.formats import read_scene
-
     server = serve(Content(read_scene(scene_folder), summary="**Alignment: pass.**"))
     browser = enter(server)
     browser.wait(lambda: len(browser.of("CameraFrustumMessage")) == 4)
@@ -346,11 +347,25 @@ def test_a_certificate_in_short(tmp_path):
     assert certificate_summary(tmp_path) == ""
     (tmp_path / "registration.json").write_text(json.dumps(CERTIFICATE))
     assert certificate_summary(tmp_path).split("\n\n") == [
-        "**Alignment: pass.** Both periods fit.",
-        "**Absolute position: not checked.** Nothing to compare with.",
+        r"**Alignment: pass\.** Both periods fit\.",
+        r"**Absolute position: not checked\.** Nothing to compare with\.",
         "**1996 and 2004: pass**",
-        "held-out reprojection error, median: 0.61 px",
+        r"held\-out reprojection error\, median\: 0\.61 px",
     ]
+
+
+def test_names_of_strangers_are_text(scene_folder, serve, tmp_path):
+    mark = "<script>x</script>![x](http://a.invalid/b)"
+    shown = r"\<script\>x\<\/script\>\!\[x\]\(http\:\/\/a\.invalid\/b\)"
+    alignment = {"verdict": mark, "text": f"a\n\n{mark}"}
+    (tmp_path / "registration.json").write_text(json.dumps(CERTIFICATE | {"alignment": alignment}))
+    summary = certificate_summary(tmp_path)
+    assert summary.startswith(rf"**Alignment: {shown}\.** a {shown}")
+    scene = read_scene(scene_folder)
+    scene = replace(scene, periods=(Period(0, mark), Period(1, mark)))
+    browser = enter(serve(Content(scene)))
+    update = {"_markdown": rf"**0\: {shown}**"}
+    browser.wait(lambda: update in [m["updates"] for m in browser.of("GuiUpdateMessage")])
 
 
 @pytest.mark.parametrize("change", [{"pairs": [{}]}, {"alignment": None}, {"pairs": [3]}])
