@@ -16,6 +16,7 @@ LAYERS = (
     ("chronoscene.api",),
     ("leaderboard", "chronoscene.survey"),
     ("chronoscene.harness.study", "chronoscene.harness.contract", "chronoscene.harness.tune"),
+    ("chronoscene.harness.view",),
     ("chronoscene.harness.run", "chronoscene.harness.train"),
     ("chronoscene.harness.report", "chronoscene.harness.use"),
     ("chronoscene.harness.score",),

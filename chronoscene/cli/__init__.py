@@ -46,6 +46,7 @@ COMMANDS = {
     "undistort": "chronoscene.cli.scenes.undistort:command",
     "validate": "chronoscene.cli.scenes.validate:command",
     "verify": "chronoscene.cli.report.verify:command",
+    "view": "chronoscene.cli.runs.view:command",
 }
 """Command name to ``module:attribute``."""
 

@@ -12,7 +12,14 @@ from chronoscene.arrays import Array
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.cameras import Viewpoint
-from chronoscene.harness.use.changes import APPEARANCE, CLASSES, GEOMETRY, ChangeMap, map_changes
+from chronoscene.harness.use.changes import (
+    APPEARANCE,
+    CLASSES,
+    GEOMETRY,
+    ChangeMap,
+    Render,
+    map_changes,
+)
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
 from chronoscene.images.truth import load_changes, truth_place
@@ -46,15 +53,30 @@ def map_run(run: TrainedRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> 
         ConfigError: If its models cannot tell periods apart, or give no depth.
         ImageError: If a file of the truth is damaged.
     """
-    if not (run.uses_period or run.strategy.model_per_period):
+    for pair in pairs:
+        made = map_pair(run, scene, pair, render=run.render)
+        yield made, score_map(run, scene, ImageStore(scene, max_width=_width(run)), made)
+
+
+def map_pair(run: TrainedRun, scene: Scene, pair: tuple[int, int], *, render: Render) -> ChangeMap:
+    """Return the map of a pair of periods.
+
+    Args:
+        run: The run.
+        scene: The scene of the run.
+        pair: Periods in their order.
+        render: Renders as the run does.
+
+    Raises:
+        ConfigError: As `map_run`.
+    """
+    if not run.distinguishes_periods:
         raise _unfit(run, "models that know the periods", "one that does not take the period")
     if "depth" not in run.spec.outputs:
         raise _unfit(run, "a method that renders depth", "one that does not")
     store = ImageStore(scene, max_width=_width(run))
-    for pair in pairs:
-        frames = [frame for frame in scene.select(split="train") if frame.period in pair]
-        made = map_changes(run.render, [_viewpoint(store, frame) for frame in frames], pair)
-        yield made, score_map(run, scene, store, made)
+    frames = [frame for frame in scene.select(split="train") if frame.period in pair]
+    return map_changes(render, [_viewpoint(store, frame) for frame in frames], pair)
 
 
 def _unfit(run: TrainedRun, expected: str, found: str) -> ConfigError:

@@ -83,6 +83,11 @@ class TrainedRun:
         return self.strategy.period_is_input(self.spec)
 
     @property
+    def distinguishes_periods(self) -> bool:
+        """True if it can show different things in different periods."""
+        return self.uses_period or self.strategy.model_per_period
+
+    @property
     def is_continuous(self) -> bool:
         """True if periods in between, such as 0.5, can be rendered."""
         return self.spec.period_input == "continuous" and self.uses_period
@@ -224,6 +229,11 @@ class TrainedRun:
             return prediction
         return replace(prediction, depth=prediction.depth / self.training_from_world.scale)
 
+    @property
+    def separates_appearance(self) -> bool:
+        """True if it can show the geometry of one period in the colours of another."""
+        return self.uses_period and hasattr(self.model(0), "render_split")
+
     def check_appearance(self, period: float) -> None:
         """Check that a model can render a geometry in the colours of this period.
 
@@ -231,7 +241,7 @@ class TrainedRun:
             ConfigError: If it cannot, or the period is not one of the run.
         """
         self.check_period(period)
-        if not self.uses_period or not hasattr(self.model(period), "render_split"):
+        if not self.separates_appearance:
             raise ConfigError(
                 f"appearance of period {period:g}",
                 expected="one model of all periods that keeps geometry and colours apart",

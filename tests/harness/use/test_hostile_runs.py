@@ -23,6 +23,7 @@ OPENING = (
     "page RUN --out OUT",
     "render RUN --out OUT",
     "survey RUN --out OUT",
+    "view RUN",
 )
 """Commands that need the model of a run."""
 READING = (

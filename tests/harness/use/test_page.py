@@ -133,21 +133,6 @@ def test_no_space_leaves_nothing_behind(trained, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.fixture(scope="module")
-def browser():
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    program = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
-    if program is None:
-        pytest.skip("no Chromium here")
-    options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with api.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(
-            executable_path=program, args=[*options, "--no-sandbox"]
-        )
-        yield opened
-        opened.close()
-
-
 def pixels(page, **options):
     """Pixels of the page, drawn once. [H, W, 3]"""
     found = page.evaluate("options => viewer.app.renderOnce(options)", options)

@@ -1,0 +1,129 @@
+"""The newest request of each viewer is drawn, small while it moves, and complete at rest."""
+
+import threading
+import time
+from concurrent.futures import CancelledError
+
+import pytest
+
+from chronoscene.harness.view.worker import FULL, LEAST, SHARE, UPDATES, RenderWorker, Resolution
+
+SIZE = (400, 400)
+
+
+@pytest.fixture
+def worker():
+    made = RenderWorker()
+    yield made
+    made.stop()
+
+
+def until(found, seconds=5.0):
+    end = time.monotonic() + seconds
+    while not found():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize("per_pixel", [1e-8, 3e-7, 1e-3])
+def test_pictures_take_the_time_that_there_is(per_pixel):
+    resolution = Resolution()
+    for _ in range(40):
+        resolution.learn(0.004 + per_pixel * resolution.pixels)
+    affordable = (SHARE / UPDATES - 0.004) / per_pixel
+    assert resolution.pixels == pytest.approx(min(max(affordable, LEAST), FULL), rel=0.05)
+
+
+def test_two_that_move_share_the_time():
+    alone, beside = Resolution(), Resolution()
+    for _ in range(40):
+        alone.learn(1e-6 * alone.pixels)
+        beside.learn(1e-6 * beside.pixels, moving=2)
+    assert beside.pixels == pytest.approx(alone.pixels / 2, rel=0.05)
+
+
+def test_one_slow_picture_changes_little():
+    resolution = Resolution()
+    resolution.learn(60.0)
+    assert resolution.pixels == pytest.approx(0.6 * 320 * 240)
+
+
+def test_only_the_newest_request_is_drawn(worker):
+    begun, go, drawn = threading.Event(), threading.Event(), []
+
+    def slow(pixels):
+        begun.set()
+        go.wait(5)
+
+    worker.request("a", slow, SIZE)
+    assert begun.wait(5)
+    for number in range(10):
+        worker.request("a", lambda pixels, number=number: drawn.append(number), (8, 8))
+    go.set()
+    until(lambda: drawn)
+    time.sleep(0.05)
+    assert drawn == [9]
+
+
+def test_a_picture_at_rest_becomes_complete_and_then_nothing_is_drawn(worker):
+    pixels = []
+    worker.request("a", pixels.append, SIZE)
+    until(lambda: pixels and pixels[-1] == 400 * 400)
+    assert pixels == [320 * 240, 400 * 400]
+    time.sleep(0.3)
+    assert len(pixels) == 2
+
+
+def test_a_small_canvas_is_complete_at_once(worker):
+    pixels = []
+    worker.request("a", pixels.append, (20, 10))
+    until(lambda: pixels)
+    time.sleep(0.25)
+    assert pixels == [200]
+
+
+def test_viewers_take_turns(worker):
+    order = []
+
+    def draw(name, pixels):
+        time.sleep(0.01)
+        order.append(name)
+        if len(order) < 20:
+            ask(name)
+
+    def ask(name):
+        worker.request(name, lambda pixels: draw(name, pixels), SIZE)
+
+    ask("a")
+    ask("b")
+    until(lambda: len(order) >= 20)
+    assert 8 <= order[:20].count("a") <= 12
+
+
+def test_a_viewer_that_left_is_forgotten(worker):
+    begun, go, drawn = threading.Event(), threading.Event(), []
+    worker.request("b", lambda pixels: (begun.set(), go.wait(5)), (8, 8))
+    assert begun.wait(5)
+    worker.request("a", drawn.append, SIZE)
+    worker.close("a")
+    worker.close("unknown")
+    go.set()
+    time.sleep(0.1)
+    assert not drawn and list(worker._seats) == ["b"]
+
+
+def test_others_draw_between_pictures_and_not_after_the_end():
+    worker, drawing, together = RenderWorker(), threading.Event(), []
+
+    def picture(pixels):
+        drawing.set()
+        time.sleep(0.05)
+        drawing.clear()
+
+    worker.request("a", picture, SIZE)
+    assert drawing.wait(5)
+    worker.between(lambda: together.append(drawing.is_set()))
+    assert together == [False]
+    worker.stop()
+    with pytest.raises(CancelledError):
+        worker.between(lambda: None)
