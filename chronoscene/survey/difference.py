@@ -117,7 +117,8 @@ def _volume(difference: Difference, cell: float, cells: Mask) -> tuple[float, fl
     if not count:
         return 0.0, 0.0
     shared = variance_of_mean(count * cell, difference.stable.length, count)
-    factors = np.where(difference.significant[cells], 1.0, difference.stable.factor)
+    factor = difference.stable.factor
+    factors = np.where(difference.significant[cells], max(1.0, factor), factor)
     variance = float((factors**2 * difference.variance[cells]).mean()) * shared
     deviation = count * cell * np.sqrt(variance + difference.registration.sigma**2)
     return float(difference.values[cells].sum()) * cell, float(CONFIDENCE * deviation)

@@ -42,40 +42,35 @@ def draw_difference(
     first, second = (canvas.plain(label) for label in labels)
     changed = np.where(difference.significant, difference.values, np.nan)
     limit = max(_range(np.abs(changed))[1], 1e-3)
-    level = 0.0, _range(difference.level)[1]
-    known = np.isfinite(later.heights)
     compared = np.where(np.isfinite(difference.values), 0.9, 1.0)[..., None].repeat(3, axis=2)
-    photo = np.where(known[..., None], later.colors, 255)
+    photo = np.where(np.isfinite(later.heights)[..., None], later.colors, 255)
 
-    def show(panel: Any, values: Any, title: str, **options: Any) -> None:
+    def show(
+        panel: Any, values: Any, title: str, colors: str | None = None, limits: Any = (None, None)
+    ) -> None:
         drawn = panel.imshow(
-            values[::step, ::step], extent=edges, interpolation="nearest", **options
-        )
+            values[::step, ::step], extent=edges, interpolation="nearest",
+            cmap=colors, vmin=limits[0], vmax=limits[1],
+        )  # fmt: skip
         panel.set_title(title, fontsize=9)
         canvas.quiet_axes(panel)
         panel.xaxis.set_major_locator(MaxNLocator(4))
-        if options:
+        if colors:
             bar = figure.colorbar(drawn, ax=panel, fraction=0.04, pad=0.02)
             bar.set_label("m", fontsize=8)
             bar.ax.tick_params(labelsize=8)
 
     (top_left, top_right), (left, right) = axes
     show(top_left, photo, f"Orthophoto, {second}")
-    show(top_right, later.heights, f"Height, {second}", **_colors("viridis", later.heights))
+    show(top_right, later.heights, f"Height, {second}", "viridis", _range(later.heights))
     show(left, compared, "")
-    title = f"Difference to {first}, where significant"
-    show(left, changed, title, cmap="RdBu", vmin=-limit, vmax=limit)
-    title = "Level of detection, 95 %"
-    show(right, difference.level, title, cmap="magma", vmin=level[0], vmax=level[1])
+    show(left, changed, f"Difference to {first}, where significant", "RdBu", (-limit, limit))
+    level = (0.0, _range(difference.level)[1])
+    show(right, difference.level, "Level of detection, 95 %", "magma", level)
     left.ticklabel_format(style="plain", useOffset=False)
     figure.supxlabel("east (m)", fontsize=9)
     figure.supylabel("north (m)", fontsize=9)
     canvas.save(figure, path)
-
-
-def _colors(name: str, values: Array) -> dict[str, Any]:
-    low, high = _range(values)
-    return {"cmap": name, "vmin": low, "vmax": high}
 
 
 def _range(values: Array) -> tuple[float, float]:
