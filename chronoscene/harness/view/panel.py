@@ -107,11 +107,12 @@ class Viewer:
         return [self._changes, self._from, self._to]
 
     def _add_scene(self) -> list[Any]:
-        gui, start = self._client.gui, POINTS[0 if self._content.runs else 2]
+        gui, runs = self._client.gui, self._content.runs
+        start = POINTS[0 if runs else min(len(self._labels), 2)]
         with gui.add_folder("Scene"):
             self._points = gui.add_dropdown("Sparse points", POINTS, initial_value=start)
             hint = "yellow: test, blue: training; a click goes there"
-            self._cameras = gui.add_checkbox("Cameras", not self._content.runs, hint=hint)
+            self._cameras = gui.add_checkbox("Cameras", not runs, hint=hint)
             self._photo: Any = None
         return [self._points, self._cameras]
 
