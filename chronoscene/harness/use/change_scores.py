@@ -53,9 +53,10 @@ def map_run(run: TrainedRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> 
         ConfigError: If its models cannot tell periods apart, or give no depth.
         ImageError: If a file of the truth is damaged.
     """
+    store = ImageStore(scene, max_width=_width(run))
     for pair in pairs:
         made = map_pair(run, scene, pair, render=run.render)
-        yield made, score_map(run, scene, ImageStore(scene, max_width=_width(run)), made)
+        yield made, score_map(run, scene, store, made)
 
 
 def map_pair(run: TrainedRun, scene: Scene, pair: tuple[int, int], *, render: Render) -> ChangeMap:

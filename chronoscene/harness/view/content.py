@@ -21,6 +21,9 @@ from chronoscene.scene.similarity import Sim3
 EXTENT = 10.0
 """Distance within which cameras and most points are, in the frame of the browser. Its depth maps
 end at 168, and its numbers are of single precision."""
+STEP_BACK = 1.5
+"""Distance of the first view in that of the cameras, which are then in it. Runs are shown from
+where the cameras are: they are trained for that."""
 PHOTO_WIDTH = 240  # Pixels of a photo in the browser
 
 
@@ -52,8 +55,10 @@ class Content:
         points = self.view_from_world.apply(self.cloud.xyz)
         if not len(points):
             points = camera_centre(self.poses) + EXTENT * self.poses[:, 2, :3]
+        target = np.nanmedian(points, axis=0)
         eye = camera_centre(orbit(self.poses, points, 1)[0])
-        return eye, np.nanmedian(points, axis=0), find_up(self.poses)
+        back = 1.0 if self.runs else STEP_BACK
+        return target + back * (eye - target), target, find_up(self.poses)
 
     def changes(self, run: TrainedRun, pair: tuple[int, int], render: Render) -> ChangeMap:
         """Return the change map of a run between two periods, made at its first use.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,10 +41,10 @@ class Layers:
         """Draw nothing yet; ``clicked`` will get the frames whose cameras are clicked."""
         self._client, self._content, self._clicked = client, content, clicked
         self._points: dict[int, viser.PointCloudHandle] = {}
-        self._frusta: dict[str, viser.CameraFrustumHandle] = {}
+        self._frusta: dict[Frame, viser.CameraFrustumHandle] = {}
         self._changes: viser.PointCloudHandle | None = None
         self._cameras_of: int | None = None
-        self._hidden = ""
+        self._hidden: Frame | None = None
         self._lock = threading.RLock()
 
     def show_points(self, period: int | None) -> None:
@@ -80,22 +81,32 @@ class Layers:
         )
 
     def show_cameras(self, period: int | None) -> None:
-        """Show the cameras of a period, or none, and their photos as they are decoded."""
+        """Show the cameras of a period, or none; `add_photos` adds their photos."""
         with self._lock:
             if period == self._cameras_of:
                 return
             for handle in self._frusta.values():
                 handle.remove()
-            self._frusta, self._cameras_of, frames = {}, period, []
+            self._frusta, self._cameras_of = {}, period
             scene = self._content.scene
             mine = [i for i, frame in enumerate(scene.frames) if frame.period == period]
             scale = FRUSTUM * EXTENT * np.sqrt(scene.num_periods / len(scene.frames))
             for i in mine[:: -(-len(mine) // MAX_CAMERAS) or 1]:
-                frames.append(frame := scene.frames[i])
-                self._frusta[frame.name] = self._add_frustum(frame, self._content.poses[i], scale)
-        for frame in frames:
-            if not self._add_photo(frame, period):
-                return
+                frame = scene.frames[i]
+                self._frusta[frame] = self._add_frustum(frame, self._content.poses[i], scale)
+
+    def add_photos(self) -> None:
+        """Show the photos of the cameras, as long as these are shown."""
+        with self._lock:
+            shown = [*self._frusta.items()]
+        for frame, handle in shown:
+            with suppress(ChronoSceneError):  # without its photo, a camera stays empty
+                image = None if handle.image is not None else self._content.photos.load(frame)
+                with self._lock:
+                    if self._frusta.get(frame) is not handle:
+                        return
+                    if image is not None:
+                        handle.image = image
 
     def _add_frustum(self, frame: Frame, pose: Array, scale: float) -> viser.CameraFrustumHandle:
         handle = self._client.scene.add_camera_frustum(
@@ -107,28 +118,17 @@ class Layers:
             color=TEST if frame.split == "test" else TRAIN,
             wxyz=quaternion_from_rotation(pose[:3, :3].T),
             position=camera_centre(pose),
-            visible=frame.name != self._hidden,
+            visible=frame is not self._hidden,
         )
         handle.on_click(lambda _: self._clicked(frame))
         return handle
 
-    def _add_photo(self, frame: Frame, period: int | None) -> bool:
-        """Return False if the cameras are no longer shown."""
-        try:
-            image = self._content.photos.load(frame)
-        except ChronoSceneError:  # the frustum stays empty
-            return True
-        with self._lock:
-            if shown := period == self._cameras_of:
-                self._frusta[frame.name].image = image
-        return shown
-
-    def hide_camera(self, name: str) -> None:
+    def hide_camera(self, frame: Frame) -> None:
         """Hide one camera, whose photo would cover its view, and show the others."""
         with self._lock:
-            self._hidden = name
+            self._hidden = frame
             for key, handle in self._frusta.items():
-                handle.visible = key != name
+                handle.visible = key is not frame
 
     def show_changes(self, made: ChangeMap | None) -> None:
         """Show the changed places of a map, in the colours of their classes, or none."""

@@ -50,7 +50,7 @@ class Viewer:
         self._views: list[KeyView] = []
         self._compared: tuple[int, list[int]] | None = None
         self._refused = ""
-        self._asking = threading.Lock()
+        self._asking, self._updating = threading.Lock(), threading.Lock()
         if content.summary:
             client.gui.add_markdown(content.summary)
         controls = [*self._add_picture(), *self._add_split(), *self._add_changes()]
@@ -61,7 +61,8 @@ class Viewer:
 
     def close(self) -> None:
         """End what goes on in the background after the browser has left."""
-        self._closed = True
+        with self._asking, self._updating:
+            self._closed = True
         self._layers.show_cameras(None)
         if self._worker is not None:
             self._worker.close(self._client.client_id)
@@ -107,11 +108,12 @@ class Viewer:
         return [self._changes, self._from, self._to]
 
     def _add_scene(self) -> list[Any]:
-        gui, start = self._client.gui, POINTS[0 if self._content.runs else 2]
+        gui, runs = self._client.gui, self._content.runs
+        start = POINTS[0 if runs else min(len(self._labels), 2)]
         with gui.add_folder("Scene"):
             self._points = gui.add_dropdown("Sparse points", POINTS, initial_value=start)
             hint = "yellow: test, blue: training; a click goes there"
-            self._cameras = gui.add_checkbox("Cameras", not self._content.runs, hint=hint)
+            self._cameras = gui.add_checkbox("Cameras", not runs, hint=hint)
             self._photo: Any = None
         return [self._points, self._cameras]
 
@@ -138,22 +140,24 @@ class Viewer:
 
     def update(self) -> None:
         """Show what the panel says."""
-        if self._closed:
-            return
         self._ask()
-        period, low = float(self._period.value), math.floor(self._period.value)
-        label = self._labels[low]
-        if share := round(100 * (period - low)):
-            label = f"{100 - share} % {label}, {share} % {self._labels[low + 1]}"
-        self._label.content = f"**{literal(label)}**"
-        self._colors.visible = self._recolored.value
-        self._wipe.visible = self._right.visible = self._split.value
-        self._other.visible = self._split.value and len(self._names) > 1
-        self._from.visible = self._to.visible = self._changes.value
-        choices = dict(zip(POINTS, (None, round(period), ALL), strict=True))
-        self._layers.show_points(choices[self._points.value])
+        with self._updating:
+            if self._closed:
+                return
+            period, low = float(self._period.value), math.floor(self._period.value)
+            label = self._labels[low]
+            if share := round(100 * (period - low)):
+                label = f"{100 - share} % {label}, {share} % {self._labels[low + 1]}"
+            self._label.content = f"**{literal(label)}**"
+            self._colors.visible = self._recolored.value
+            self._wipe.visible = self._right.visible = self._split.value
+            self._other.visible = self._split.value and len(self._names) > 1
+            self._from.visible = self._to.visible = self._changes.value
+            choices = dict(zip(POINTS, (None, round(period), ALL), strict=True))
+            self._layers.show_points(choices[self._points.value])
+            self._layers.show_cameras(round(period) if self._cameras.value else None)
+        self._layers.add_photos()
         self._compare()
-        self._layers.show_cameras(round(period) if self._cameras.value else None)
 
     # The picture.
 
@@ -170,12 +174,11 @@ class Viewer:
 
     def _ask(self) -> None:
         """Ask for a picture of what camera and panel say now."""
-        if self._worker is None or self._closed:
-            return
         with self._asking:  # else an older state could be asked for last
-            view, size = self._now(), self._size
-            draw = partial(self._draw, view, size, self._sides(view.period))
-            self._worker.request(self._client.client_id, draw, size)
+            if self._worker is not None and not self._closed:
+                view, size = self._now(), self._size
+                draw = partial(self._draw, view, size, self._sides(view.period))
+                self._worker.request(self._client.client_id, draw, size)
 
     def _draw(self, view: KeyView, size: tuple[int, int], sides: list[Side], pixels: int) -> None:
         """Draw a picture and send it; called by the worker."""
@@ -244,7 +247,7 @@ class Viewer:
 
     def _visit(self, frame: Frame) -> None:
         """Go to the camera of a photo, and show the photo in the panel."""
-        self._layers.hide_camera(frame.name)
+        self._layers.hide_camera(frame)
         pose = self._content.view_from_world.apply_to_pose(frame.cam_from_world)
         with self._client.atomic():
             self._client.camera.position = camera_centre(pose)

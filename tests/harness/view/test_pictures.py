@@ -1,5 +1,7 @@
 """Pictures of the viewer are those of the runs: sides, fading periods, colours, depth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,10 @@ def test_weights_of_neighbours(runs):
     assert neighbours(runs["chronogs"], 0.3) == [(0.3, 1.0)]
     assert neighbours(runs["4dgs"], 1) == [(1, 1.0)]
     assert neighbours(runs["4dgs"], 0.75) == [(0, 0.25), (1, 0.75)]
+    joint = runs["chronogs"]
+    pooled = replace(joint, record=joint.record.model_copy(update={"strategy": "pooled"}))
+    assert neighbours(pooled, 0.75) == [(0, 1.0)]  # one picture, as all are the same
+    assert joint.separates_appearance and not pooled.separates_appearance
 
 
 def test_each_side_has_its_period_and_method(runs, view):

@@ -219,6 +219,12 @@ def test_a_scene_has_points_and_cameras(scene_folder, serve):
     browser = enter(server)
     browser.wait(lambda: len(browser.of("CameraFrustumMessage")) == 4)
     assert browser.of("PointCloudMessage")[0]["name"] == "/points/-1"
+
+    def photos():
+        updates = browser.of("SceneNodeUpdateMessage")
+        return {m["name"] for m in updates if "_image_data" in m["updates"]}
+
+    browser.wait(lambda: photos() == {f"/cameras/{number}" for number in (1, 2, 3, 4)})
     assert "pass" in str(browser.of("GuiMarkdownMessage")[0])
     assert not browser.pictures()
 
