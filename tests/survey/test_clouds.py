@@ -57,8 +57,9 @@ def plane(normal, shift, seed):
     return PointCloud(xyz, np.zeros((6000, 3), np.uint8), towards, np.full(6000, 0.02))
 
 
-@pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, -1, 0)])
-@pytest.mark.parametrize("shift", [0.4, -0.4])
+@pytest.mark.parametrize(
+    ("normal", "shift"), [((0, 0, 1), 0.4), ((1, 0, 0), -0.4), ((0, -1, 0), 0.4)]
+)
 def test_what_was_added_has_a_positive_distance(normal, shift):
     found = measure_distances(plane(normal, 0, 1), plane(normal, shift, 2), 0.2, 0.01)
     offsets = found.cores.xyz - [500, 900, 20]
