@@ -26,7 +26,7 @@ MAX_POINTS, MAX_CAMERAS = 300_000, 300
 """Points of a scene, and cameras of a period, that a browser gets: a choice that is the same for
 equal scenes."""
 FRUSTUM = 0.12  # Length of a drawn frustum in mean distances between neighbouring cameras
-POINT, PLACE = 0.003 * EXTENT, 0.004 * EXTENT  # Edges of points, and of places of a change map
+POINT = 0.003 * EXTENT  # Edge of a point, or of a place of a change map
 TEST, TRAIN = (255, 193, 36), (76, 134, 255)  # Colours of frusta
 CHANGED = (2, 3, 4)  # Classes of a change map that are drawn
 ALL = -1  # In place of a period: all of them
@@ -65,16 +65,16 @@ class Layers:
         else:
             numbers = numbers[np.isin(cloud.period[numbers], (period, -1))]
             colors = self._content.scene.points.rgb[numbers]
-        return self._add_cloud(f"/points/{period}", cloud.xyz[numbers], colors, POINT)
+        return self._add_cloud(f"/points/{period}", cloud.xyz[numbers], colors)
 
     def _add_cloud(
-        self, name: str, xyz: Array, colors: NDArray[np.uint8], size: float
+        self, name: str, xyz: Array, colors: NDArray[np.uint8]
     ) -> viser.PointCloudHandle:
         return self._client.scene.add_point_cloud(
             name,
             self._content.view_from_world.apply(xyz).astype(np.float32),
             colors,
-            point_size=size,
+            point_size=POINT,
             point_shape="circle",
             point_shading="flat",
             precision="float32",
@@ -140,4 +140,4 @@ class Layers:
                 rows = np.isin(made.classes, CHANGED)
                 palette = np.array([rgb_of(color) for color in COLORS.values()]).astype(np.uint8)
                 colors = palette[made.classes[rows]]
-                self._changes = self._add_cloud("/changes", made.xyz[rows], colors, PLACE)
+                self._changes = self._add_cloud("/changes", made.xyz[rows], colors)
