@@ -11,11 +11,10 @@ whole area and over squares of 20 m.
 from __future__ import annotations
 
 import json
-import sys
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+import click
 import laspy
 import numpy as np
 import rasterio
@@ -69,6 +68,9 @@ def robust(errors: Array) -> str:
     return f"median {median:+.3f} NMAD {nmad:.3f} RMSE {rmse:.2f} m of {len(errors):,} cells"
 
 
+@click.command(help=__doc__)
+@click.argument("scene_root", metavar="SCENE", type=click.Path(path_type=Path))
+@click.argument("survey", type=click.Path(path_type=Path))
 def main(scene_root: Path, survey: Path) -> None:
     """Print all comparisons."""
     scene = detect(scene_root).read()
@@ -125,7 +127,7 @@ def compare(pair: dict, survey: Path, grid: Grid, truth: dict[int, Array]) -> li
         inside = np.zeros(grid.shape, bool)
         inside[row : row + steps, column : column + steps] = True
         if known[inside].sum() >= MIN_KNOWN * steps**2:
-            square = measure_volumes(replace(made), grid, "", inside)
+            square = measure_volumes(made, grid, "", inside)
             error = square.net_m3 - change[inside & known].sum() * grid.resolution**2
             covered.append(bool(abs(error) <= square.net_interval_m3))
     return covered
@@ -151,4 +153,4 @@ def describe(clouds: laspy.LasData, grid: Grid, change: Array) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main()

@@ -56,8 +56,9 @@ def measure_distances(
         return f"{len(first)} and {len(second)} points are too few for surfaces"
     import py4dgeo
 
-    # It would log to standard output, and to a file in the current folder.
-    logging.getLogger("py4dgeo").handlers.clear()
+    log = logging.getLogger("py4dgeo")
+    log.setLevel(logging.WARNING)
+    log.handlers.clear()  # one of them writes a file into the current folder
     spread = float(np.nan_to_num(np.median(np.concatenate([first.spread, second.spread]))))
     unit = max(spacing, 2 * spread)
     first, second = first.thinned(unit), second.thinned(unit)

@@ -74,7 +74,8 @@ def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Mask]:
         cells = geometry_mask([shape], grid.shape, _transform(grid), invert=True)
         if not cells.any():
             raise _wrong(place, "a polygon on the map", "one outside", "check its coordinates")
-        name = str((feature.get("properties") or {}).get("name", number))
+        properties = feature.get("properties")
+        name = str(properties.get("name", number) if isinstance(properties, dict) else number)
         named[name if name not in named else f"{name} ({number})"] = cells
     if not named:
         raise _wrong(f"--area {path}", "polygons", "none", "draw at least one")

@@ -1,5 +1,6 @@
 """Points of a scene whose surfaces are known, and signed distances between two clouds."""
 
+import logging
 from dataclasses import fields
 
 import numpy as np
@@ -86,6 +87,14 @@ def test_the_level_of_detection_has_the_registration_in_it():
         for r in (0.0, 0.05)
     ]
     assert levels[1] - levels[0] == pytest.approx(1.96 * 0.05, rel=0.2)
+
+
+def test_nothing_is_logged_into_the_current_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    measure_distances(plane((0, 0, 1), 0, 1), plane((0, 0, 1), 0, 2), 0.2, 0.0)
+    assert not capsys.readouterr().out
+    logging.getLogger("py4dgeo").warning("nothing")
+    assert not list(tmp_path.iterdir())
 
 
 def test_few_points_give_a_reason():

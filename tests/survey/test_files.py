@@ -116,6 +116,12 @@ def test_equal_names_stay_apart(tmp_path):
     assert list(read(tmp_path, data)) == ["pit", "pit (2)"]
 
 
+def test_properties_of_another_kind(tmp_path):
+    data = geojson(SQUARE)
+    data["features"][0]["properties"] = [3]
+    assert list(read(tmp_path, data)) == ["1"]
+
+
 @pytest.mark.parametrize(
     ("data", "frame", "message"),
     [
@@ -125,6 +131,12 @@ def test_equal_names_stay_apart(tmp_path):
         ({"features": [3]}, UTM, "feature 1: expected a polygon"),
         ({"type": "Point", "coordinates": [0, 0]}, UTM, "expected a polygon"),
         ({"type": "Polygon", "coordinates": [[[0, 0], ["x", 1]]]}, UTM, "expected a polygon"),
+        (geojson(SQUARE * np.nan), UTM, "expected a polygon"),
+        (geojson(SQUARE * np.inf), UTM, "expected a polygon"),
+        ({"features": [{"geometry": None}]}, UTM, "expected a polygon"),
+        (geojson([[200, 95], [201, 95], [201, 96], [200, 95]]), UTM, "on the map"),
+        (geojson([[2e2, 9e1], [1e300, 0], [0, 1], [2e2, 9e1]]), UTM, "on the map"),
+        (geojson([[180, 90], [-180, 90], [0, -90], [180, 90]]), UTM, "on the map|expected"),
         (geojson(SQUARE + 1e4), UTM, "on the map, found one outside"),
         (geojson(SQUARE, "EPSG:nonsense"), UTM, "a known crs"),
         (geojson(SQUARE, "EPSG:32632"), HERE, "no crs, as the scene has none"),
