@@ -28,11 +28,12 @@ from chronoscene.images.store import ImageStore
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.log import Log
 from chronoscene.io.processes import Report
-from chronoscene.io.staging import staged_folder
+from chronoscene.io.staging import sha256_of, staged_folder
 from chronoscene.registration.context import Options as Registration
 from chronoscene.registration.output import CERTIFICATE, PAGE, Inspection
 from chronoscene.registration.photos.captures import find_captures, read_captures
 from chronoscene.registration.pipeline import run as register
+from chronoscene.registration.work_folder import fingerprint
 from chronoscene.scene import Scene
 from chronoscene.validation.report.html import write_html
 from chronoscene.validation.run import validate_scene
@@ -69,6 +70,13 @@ class Project:
     def scene(self) -> Path:
         """Folder of the registered scene."""
         return self.out / "register" / self.out.resolve().name
+
+    @property
+    def runs(self) -> Path:
+        """Folder of runs that share their ground truth: of this scene, in this width."""
+        results = self.record.steps["register"].results
+        scene = fingerprint([sha256_of(self.out / path) for path in results])
+        return self.out / "bench" / f"{self.options['max_width']}px-{scene[:8]}"
 
     @property
     def run(self) -> Path:
@@ -150,10 +158,10 @@ def _validate(project: Project) -> Sequence[Path]:
 def _bench(project: Project) -> Sequence[Path]:
     _check_alignment(project)
     options: dict[str, Any] = {**project.options, "log": project.say, "overwrite": True}
-    result = bench(project.scene, METHOD, out=project.out / "bench", **options)
+    result = bench(project.scene, METHOD, out=project.runs, **options)
     if result.failures:
         raise CheckpointError(
-            project.out / "bench",
+            project.runs,
             expected="a finished training",
             found=result.failures[0].reason,
             todo="mend that, and run the same command again",
@@ -162,8 +170,8 @@ def _bench(project: Project) -> Sequence[Path]:
 
 
 def _bench_command(project: Project) -> str:
-    words, out = ("bench", project.scene, "--method", METHOD), project.out / "bench"
-    return project.command(*words, **project.options, out=out)
+    words = "bench", project.scene, "--method", METHOD
+    return project.command(*words, **project.options, out=project.runs)
 
 
 def _check_alignment(project: Project) -> None:

@@ -120,15 +120,40 @@ def test_a_failed_alignment_is_not_trained_on(fake, monkeypatch):
         fake.go(budget="3m")
     commands = [line for line in str(stopped.value).splitlines() if line.startswith("  ")]
     scene = fake.out / "register/out"
+    runs = commands[1].rpartition(" ")[2]
+    assert runs.startswith(f"{fake.out}/bench/500px-")
     assert commands == [
         f"  chronoscene register {fake.photos} {scene} --overwrite --report "
         "--tie-points clicks.csv",
         f"  chronoscene bench {scene} --method chronogs --preset fast --budget 3m --max-width 500 "
-        f"--out {fake.out}/bench",
+        f"--out {runs}",
         f"  chronoscene page RUN --out {fake.out}/page",
     ]
     assert "page" not in fake.calls
     assert fake.states["bench"] == "failed"
+
+
+def test_runs_in_one_folder_share_scene_and_width(fake, monkeypatch):
+    folders = []
+
+    def train(scene, method, *, out, **options):
+        folders.append(out)
+        raise RegistrationError("bench", expected="time", found="none", todo="wait")
+
+    monkeypatch.setattr(steps, "bench", train)
+    monkeypatch.setattr(fake, "bench", steps._bench, raising=False)
+    for poses, options in (
+        ("first", {"budget": "1m"}),
+        ("first", {"budget": "2m"}),
+        ("first", {"max_width": 300}),
+        ("second", {"max_width": 300}),
+    ):
+        (fake.photos / "2016/1.jpg").write_text(poses)
+        fake.poses = poses
+        with pytest.raises(RegistrationError):
+            fake.go(**options)
+    assert folders[0] == folders[1]
+    assert len(set(folders)) == 3
 
 
 @pytest.mark.parametrize(
