@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = (
     ("chronogs", "baselines", "chronoscene.__main__"),
     ("chronoscene.cli",),
+    ("chronoscene.workflow",),
     ("chronoscene.api",),
     ("leaderboard", "chronoscene.survey"),
     ("chronoscene.harness.study", "chronoscene.harness.contract", "chronoscene.harness.tune"),

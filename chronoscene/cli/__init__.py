@@ -14,6 +14,7 @@ from chronoscene.io.staging import disk_full
 from chronoscene.io.wording import printable_lines
 
 COMMANDS = {
+    "all": "chronoscene.cli.runs.all:command",
     "bench": "chronoscene.cli.runs.bench:command",
     "changes": "chronoscene.cli.runs.changes:command",
     "check-method": "chronoscene.cli.methods.check_method:check",

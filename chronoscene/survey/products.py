@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -18,6 +19,7 @@ from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.processes import Report
+from chronoscene.io.tables import csv_text
 from chronoscene.scene import Scene
 from chronoscene.survey.cloud import PointCloud, dense_cloud, sparse_cloud
 from chronoscene.survey.difference import measure_volumes, subtract
@@ -32,6 +34,7 @@ from chronoscene.survey.uncertainty import CERTIFICATE, find_registration, stabl
 from chronoscene.survey.views import depth_views
 
 WHOLE = "whole area"
+SUMMARY, VOLUMES = "survey.json", "volumes.csv"
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +172,26 @@ def check_packages() -> None:
                 found="none",
                 todo="pip install 'chronoscene[survey]'",
             )
+
+
+def write_survey(
+    run: TrainedRun | None, scene: Scene, folder: Path, options: SurveyOptions, report: Report
+) -> dict[str, Any]:
+    """Write all products of a finished run, or those of a scene without one, and the summary.
+
+    Arguments, result and errors as for `survey_run`.
+    """
+    if run is None:
+        summary = survey_scene(scene, folder, options)
+    else:
+        summary = survey_run(run, scene, folder, options, report)
+        pairs = summary["pairs"]
+        rows = [dict(zip("ab", p["periods"], strict=True)) | v for p in pairs for v in p["volumes"]]
+        table = csv_text(list(rows[0]) if rows else [], [list(row.values()) for row in rows])
+        (folder / VOLUMES).write_text(table, encoding="utf-8", newline="\n")
+    text = json.dumps(summary, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    (folder / SUMMARY).write_text(text, encoding="utf-8", newline="\n")
+    return summary
 
 
 def survey_run(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import combinations, pairwise
 from pathlib import Path
 
 import click
@@ -18,12 +17,10 @@ from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
 from chronoscene.figures.cloud import cloud_of
 from chronoscene.formats.shared.ply import write_vertices
 from chronoscene.harness.use.change_scores import changes_csv, changes_table, map_run
-from chronoscene.harness.use.changes import ChangeMap
+from chronoscene.harness.use.changes import ALL_PAIRS, ChangeMap, usual_pairs
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import boxed_text
-
-_ALL_PAIRS = 4  # Periods of which all pairs are compared unless the user chooses
 
 
 @click.command("changes")
@@ -40,7 +37,7 @@ _ALL_PAIRS = 4  # Periods of which all pairs are compared unless the user choose
     multiple=True,
     metavar="PERIOD PERIOD",
     help="Compare these two periods (numbers or labels); may be repeated.  [default: all pairs of "
-    f"up to {_ALL_PAIRS} periods; of more, each with the next]",
+    f"up to {ALL_PAIRS} periods; of more, each with the next]",
 )
 @SCENE
 @PLUGIN
@@ -89,13 +86,6 @@ def command(
     report_written(out)
     if not any(scores for _, scores in maps):
         say(f"not scored: no change masks of test views in {found.root / 'gt'}")
-
-
-def usual_pairs(periods: int) -> list[tuple[int, int]]:
-    """The pairs that are compared unless the user chooses; they do not grow with the square of many
-    periods."""
-    numbers = range(periods)
-    return list(combinations(numbers, 2) if periods <= _ALL_PAIRS else pairwise(numbers))
 
 
 def _pair(run: TrainedRun, *names: str) -> tuple[int, int]:

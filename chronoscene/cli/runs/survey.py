@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,15 +11,15 @@ import click
 from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE
 from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
 from chronoscene.cli.progress import announce, progress_bar
-from chronoscene.cli.runs.changes import usual_pairs
 from chronoscene.cli.scenes.reading import read_and_note
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RUN_FILE
+from chronoscene.harness.use.changes import usual_pairs
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside, staged_folder
-from chronoscene.io.tables import Table, boxed_text, csv_text
+from chronoscene.io.tables import Table, boxed_text
 from chronoscene.scene import Scene
-from chronoscene.survey.products import SurveyOptions, check_packages, survey_run, survey_scene
+from chronoscene.survey.products import SurveyOptions, check_packages, write_survey
 
 
 @click.command("survey")
@@ -77,13 +76,7 @@ def command(
     pairs = tuple(_pair(found, *names) for names in between) or usual_pairs(found.num_periods)
     options = SurveyOptions(tuple(pairs), resolution, area, crs)
     with staged_folder(out) as staged, progress_bar() as report:
-        if run is None:
-            summary = survey_scene(found, staged, options)
-        else:
-            summary = survey_run(run, found, staged, options, report)
-            _write_volumes(staged / "volumes.csv", summary["pairs"])
-        text = json.dumps(summary, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-        (staged / "survey.json").write_text(text, encoding="utf-8", newline="\n")
+        summary = write_survey(run, found, staged, options, report)
     _print(summary)
     report_written(out)
 
@@ -100,12 +93,6 @@ def _pair(scene: Scene, *names: str) -> tuple[int, int]:
             todo=f"choose among {', '.join(f'{p.id} ({p.label})' for p in scene.periods)}",
         )
     return first, second
-
-
-def _write_volumes(path: Path, pairs: list[dict[str, Any]]) -> None:
-    rows = [dict(zip("ab", p["periods"], strict=True)) | v for p in pairs for v in p["volumes"]]
-    heads = list(rows[0]) if rows else []
-    path.write_text(csv_text(heads, [list(row.values()) for row in rows]), "utf-8", newline="\n")
 
 
 def _print(summary: Mapping[str, Any]) -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,8 @@ APPEARANCE = 0.08
 CLASSES = ("unchanged", "unknown", "appearance", "gone", "new")
 """Classes by their number in `ChangeMap.classes`. Gone are places on surfaces of the first period,
 new are places on surfaces of the second."""
+ALL_PAIRS = 4
+"""Number of periods up to which all pairs are compared unless the user chooses."""
 _DARK = 0.05  # Added to colours before their brightness is divided out: black has no hue
 _ROUNDS = 10  # Of reweighted least squares
 
@@ -205,6 +208,13 @@ class _Surface:
     def mean_colors(self) -> Array:
         """Mean colours at the period of the surface and at the other one. [2, N, 3]"""
         return self.colors / np.maximum(self.views, 1)[:, None]
+
+
+def usual_pairs(periods: int) -> list[tuple[int, int]]:
+    """Return the pairs that are compared unless the user chooses; they do not grow with the square
+    of many periods."""
+    numbers = range(periods)
+    return list(combinations(numbers, 2) if periods <= ALL_PAIRS else pairwise(numbers))
 
 
 def surface_depth(prediction: Prediction) -> Array:

@@ -81,10 +81,10 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
         return _assemble(path, _from_table(path, table))
     if groups := _period_folders(path):
         return _assemble(path, groups)
-    return _assemble(path, *_by_date(path, _photos_in(path)))
+    return _assemble(path, *_by_date(path, photos_in(path)))
 
 
-def _photos_in(folder: Path) -> list[Path]:
+def photos_in(folder: Path) -> list[Path]:
     """List image files below a folder, sorted, without hidden files and folders."""
     found = [
         p
@@ -98,7 +98,7 @@ def _photos_in(folder: Path) -> list[Path]:
 
 def _period_folders(root: Path) -> list[_Listed]:
     """List photos by subfolder; none if there are photos in the root, or only one subfolder."""
-    photos = _photos_in(root)
+    photos = photos_in(root)
     tops = {p.relative_to(root).parts[0] for p in photos if len(p.relative_to(root).parts) > 1}
     if len(tops) < 2 or any(p.parent == root for p in photos):
         return []

@@ -11,10 +11,9 @@ from click.testing import CliRunner
 from PIL import Image
 
 from chronoscene.cli import cli
-from chronoscene.cli.runs.changes import usual_pairs
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.harness.use.change_scores import changes_csv, changes_table, map_run
-from chronoscene.harness.use.changes import GEOMETRY
+from chronoscene.harness.use.changes import GEOMETRY, usual_pairs
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.images import truth
 

@@ -39,8 +39,9 @@ READING = (
 )
 """Commands that read other files of runs."""
 OTHERS = {
-    *("check-method", "convert", "doctor", "download", "new-method", "register", "score-images"),
-    *("edit", "split", "stats", "study", "synth", "triangulate", "tune", "undistort", "validate"),
+    *("all", "check-method", "convert", "doctor", "download", "edit", "new-method", "register"),
+    *("score-images", "split", "stats", "study", "synth", "triangulate", "tune", "undistort"),
+    "validate",
 }
 """Commands that read no runs, or as ``bench`` does."""
 

@@ -1,0 +1,46 @@
+"""``chronoscene all``: from photos of several dates to scene, model and products."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chronoscene.cli.options import EXISTING_FILE, PATH, add_options
+from chronoscene.cli.output import check_place, report_written, say
+from chronoscene.cli.progress import progress_bar
+from chronoscene.cli.runs.bench import BUDGET, WIDTH
+from chronoscene.workflow.run import run_steps, start
+from chronoscene.workflow.steps import Project
+
+
+@click.command("all")
+@click.argument("captures", type=PATH)
+@click.argument("out", type=PATH)
+@click.option(
+    "--table",
+    type=EXISTING_FILE,
+    help="CSV with the columns image and period; paths are relative to CAPTURES.",
+)
+@add_options("preset")
+@BUDGET
+@WIDTH
+def command(captures: Path, out: Path, table: Path | None, **options: Any) -> None:
+    """Make a scene, a model, a page and products from photos.
+
+    CAPTURES is what register takes: for example, a folder with a subfolder of photos for each
+    period. The photos are registered, the scene is checked, ChronoGS is trained on it, and the
+    model is made into a page to walk through and exported. OUT/index.html links everything. The
+    same command continues a run that was stopped; where photos or options have changed, it makes
+    anew what follows from them.
+
+    The training is not begun if the alignment of the periods fails. Exit status: 0 if all steps are
+    done or were skipped for a reason, 2 if one fails.
+    """
+    check_place("OUT", out)
+    record, changes = start(captures, table, out, options)
+    if changes:
+        say(changes)
+    page = run_steps(Project(captures, table, out, options, record, say, progress_bar))
+    report_written(page)
