@@ -17,6 +17,7 @@ from chronoscene.registration.photos.captures import photos_in
 RECORD_FILE = "steps.json"
 
 Options = Mapping[str, str | int | None]
+State = Literal["done", "skipped", "failed"]
 
 
 class StepRecord(BaseModel):
@@ -24,7 +25,7 @@ class StepRecord(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    state: Literal["done", "skipped", "failed"]
+    state: State
     key: str
     """Fingerprint of all that the result depends on."""
     seconds: float

@@ -17,6 +17,7 @@ from chronoscene.workflow.record import (
     RECORD_FILE,
     Options,
     Record,
+    State,
     StepRecord,
     describe_changes,
     new_record,
@@ -92,7 +93,10 @@ def _run_step(project: Project, step: Step) -> StepRecord:
     """Run a step and record how it ended."""
     started, key = time.monotonic(), _key(project, step)
     results: Sequence[Path] = ()
-    state, reason = "failed", "stopped before its end"
+    state: State = "failed"
+    reason = "stopped before its end"
+    project.record.steps.pop(step.name, None)
+    _write(project)
     try:
         results = step.make(project)
         state, reason = "done", ""
