@@ -4,7 +4,8 @@ All values are float32: the centre, the rotation xyzw, the scales, the opacity, 
 harmonics of degree 0 to 3 by degree and order. They are in the frame of the scene; the node turns
 it so that up is +y, as glTF has it.
 
-Source: KHR_gaussian_splatting of github.com/KhronosGroup/glTF, release candidate.
+Source: KHR_gaussian_splatting of github.com/KhronosGroup/glTF, ratified; a draft before had the
+logarithms of the scales.
 """
 
 from __future__ import annotations

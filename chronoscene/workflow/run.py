@@ -95,6 +95,8 @@ def _run_step(project: Project, step: Step) -> StepRecord:
     results: Sequence[Path] = ()
     state: State = "failed"
     reason = "stopped before its end"
+    project.record.steps.pop(step.name, None)
+    _write(project)
     try:
         results = step.make(project)
         state, reason = "done", ""

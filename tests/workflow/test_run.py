@@ -185,3 +185,15 @@ def test_a_damaged_record_is_one_error(fake, text):
     (fake.out / "steps.json").write_text(text)
     with pytest.raises(ChronoSceneError, match=r"steps\.json"):
         fake.go()
+
+
+def test_a_step_under_way_has_no_result(fake, monkeypatch):
+    pages = []
+    monkeypatch.setattr(fake, "broken", "page")
+    with pytest.raises(RegistrationError):
+        fake.go()
+    make = fake.page
+    monkeypatch.setattr(fake, "page", lambda p: pages.append(fake.html) or make(p), raising=False)
+    fake.broken = ""
+    fake.go()
+    assert "Stopped" not in pages[0]
