@@ -91,7 +91,7 @@ def run_steps(project: Project) -> Path:
 
 def _run_step(project: Project, step: Step) -> StepRecord:
     """Run a step and record how it ended."""
-    started, key = time.monotonic(), _key(project, step)
+    started, key, out = time.monotonic(), _key(project, step), project.out.resolve()
     results: Sequence[Path] = ()
     state: State = "failed"
     reason = "stopped before its end"
@@ -111,7 +111,7 @@ def _run_step(project: Project, step: Step) -> StepRecord:
             key=key,
             seconds=time.monotonic() - started,
             reason=reason,
-            results=[path.relative_to(project.out).as_posix() for path in results],
+            results=[path.resolve().relative_to(out).as_posix() for path in results],
         )
         _write(project)
     return project.record.steps[step.name]
