@@ -44,7 +44,7 @@ def jump(period: float) -> tuple[float, float, float]:
     return (0.25, -0.1, 0.0) if period < 2.2 else (-0.25, 0.1, 0.0)
 
 
-@pytest.mark.parametrize("color_and_opacity", [False, True])
+@pytest.mark.parametrize("color_and_opacity", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_smooth_motion_is_followed_between_periods_and_a_jump_is_not(
     color_and_opacity: bool,
 ) -> None:

@@ -220,6 +220,7 @@ def test_one_period_has_one_block_for_each_anchor_and_no_global_feature() -> Non
     assert psnr(made, 0, 0) > 20.0
 
 
+@pytest.mark.slow
 def test_forty_periods() -> None:
     made = train((0,) * 20 + (1,) * 20, **LEAN)
     assert len(made.model.blocks) < 0.2 * made.model.block_rows.numel()

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from chronoscene.kernels.compilation import source_stamp
 from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.cpu import composite
@@ -37,6 +39,7 @@ def run(cache: Path) -> tuple[float, int]:
     return float(total), int(hits)
 
 
+@pytest.mark.slow
 def test_kept_and_compiled_again_where_the_index_is_damaged(tmp_path: Path) -> None:
     assert run(tmp_path) == (20.0, 0)
     assert run(tmp_path) == (20.0, 1)

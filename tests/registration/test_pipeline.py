@@ -143,6 +143,7 @@ def test_route_separate(
     assert share < 0.02
 
 
+@pytest.mark.slow
 def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
     joint: tuple[Path, Registered], captures: Path, truth: Scene, tmp_path: Path
 ) -> None:

@@ -123,6 +123,7 @@ def test_a_run_that_fails_stops_nobody_else(on_ray):
     assert "expected a machine with 5 processors, 0.10 GB" in outcome.failures[0].reason
 
 
+@pytest.mark.slow
 def test_other_code_is_told_and_another_version_refused(on_ray, monkeypatch):
     monkeypatch.setattr(ray_pool, "code_version", lambda: "another")
     outcome, said = on_ray("MEAN", seeds=(0, 1))

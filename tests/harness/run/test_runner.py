@@ -241,6 +241,7 @@ def test_seeds_overrides_and_budgets(bench_here):
     assert config["stop"] == {"iterations": None, "seconds": 0.4}
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_bench_and_leaves_nothing_half(bench, tmp_path):
     with pytest.raises(DiskFullError, match=r"balanced-iterations=1/seed0: expected space for"):
         bench("MEAN", "FULL_DISK", "BLIND", iterations=1)
@@ -324,6 +325,7 @@ def test_images_are_trained_and_scored_at_the_evaluation_size(bench_here):
     assert "ssim_valid" in read_run(folder).skipped
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_run_alone(bench):
     """A worker does not inherit the peak of a big parent, and its own arrays count."""
     parent = np.ones(1_000_000_000, np.uint8)

@@ -124,6 +124,7 @@ def test_failed_trials_count(search):
         search("none", 2, execute=lambda job: job.failure("too bad"))
 
 
+@pytest.mark.slow
 def test_several_trials_at_a_time(search):
     results = search("out", 3, execute=None, jobs=2)
     assert [result.number for result in results] == [0, 1, 2]
