@@ -1,0 +1,47 @@
+"""Steps that call the rest of the package, without the steps before them."""
+
+from dataclasses import replace
+
+import pytest
+from surveyed import ToyRun, make_scene
+
+from chronoscene.cli.progress import progress_bar
+from chronoscene.errors import BackendError
+from chronoscene.scene import WorldFrame
+from chronoscene.workflow import steps
+from chronoscene.workflow.record import Record
+from chronoscene.workflow.steps import STEPS, Project, Skipped
+
+SURVEY = STEPS[-1]
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A project whose model is a toy."""
+    scene = make_scene(tmp_path / "scene")
+    monkeypatch.setattr(Project, "opened", lambda self: (ToyRun(scene, noise=0.01), scene))
+    record = Record(photos={}, options={})
+    return Project(tmp_path / "photos", None, tmp_path, {}, record, print, progress_bar)
+
+
+def test_the_products_of_a_survey_are_found_by_its_summary(project, tmp_path):
+    first, *others = SURVEY.make(project)
+    assert first == tmp_path / "survey/survey.json"
+    names = {path.name for path in others}
+    assert {"difference_0_1.png", "surface_after_1.tif", "volumes.csv"} <= names
+    assert {first, *others} == set((tmp_path / "survey").iterdir())
+
+
+def test_without_metres_or_packages_it_is_skipped(project, tmp_path, monkeypatch):
+    def missing():
+        raise BackendError("survey", expected="laspy", found="none", todo="install it")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(steps, "check_packages", missing)
+        with pytest.raises(Skipped, match="expected laspy"):
+            SURVEY.make(project)
+    scene = replace(make_scene(tmp_path / "scene"), world=WorldFrame("unknown"))
+    monkeypatch.setattr(Project, "opened", lambda self: (ToyRun(scene), scene))
+    with pytest.raises(Skipped, match="the scene has no scale"):
+        SURVEY.make(project)
+    assert not (tmp_path / "survey").exists()
