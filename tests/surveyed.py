@@ -71,7 +71,7 @@ def make_scene(root=Path("scene"), world=None):
 
 
 class ToyRun:
-    """What a survey asks of a `TrainedRun`."""
+    """A stand-in for a `TrainedRun` that renders the plane and the box."""
 
     def __init__(self, scene=None, *, noise=0.0, uses_period=True):
         self.found, self.noise, self.uses_period = scene, noise, uses_period

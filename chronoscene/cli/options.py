@@ -34,6 +34,12 @@ def reading_options(scene: str) -> Callable[[Any], Any]:
     return lambda command: format_option(period_option(command))
 
 
+TABLE = click.option(
+    "--table",
+    type=EXISTING_FILE,
+    help="CSV with the columns image and period; paths are relative to CAPTURES.",
+)
+
 RUNS = click.argument("folders", metavar="RUNS...", nargs=-1, required=True, type=EXISTING_FOLDER)
 
 SCENES = click.argument("scenes", metavar="[DIR]...", nargs=-1, type=FOLDER)

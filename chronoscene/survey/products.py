@@ -20,6 +20,8 @@ from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.processes import Report
 from chronoscene.io.tables import csv_text
+from chronoscene.registration.output import CERTIFICATE
+from chronoscene.registration.report.coordinates import GEOREFERENCE
 from chronoscene.scene import Scene
 from chronoscene.survey.cloud import PointCloud, dense_cloud, sparse_cloud
 from chronoscene.survey.difference import measure_volumes, subtract
@@ -30,7 +32,7 @@ from chronoscene.survey.laz import write_points
 from chronoscene.survey.map_frame import MapFrame, map_frame
 from chronoscene.survey.rasters import read_polygons, write_raster
 from chronoscene.survey.surface import Surface, map_surface
-from chronoscene.survey.uncertainty import CERTIFICATE, find_registration, stable_ground
+from chronoscene.survey.uncertainty import find_registration, stable_ground
 from chronoscene.survey.views import depth_views
 
 WHOLE = "whole area"
@@ -144,7 +146,7 @@ class Survey:
     def coordinates(self) -> dict[str, Any]:
         """Describe coordinates and absolute position."""
         frame, root = self.frame, self.scene.root
-        kind = _optional(root / "georeference.json").get("height_kind", "as stated")
+        kind = _optional(root / GEOREFERENCE).get("height_kind", "as stated")
         return {
             "crs": None if frame.is_local else frame.crs,
             "note": "local metres: the scene has no georeference" if frame.is_local else None,

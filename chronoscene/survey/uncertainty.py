@@ -14,10 +14,10 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.io.documents import read_json_document
+from chronoscene.registration.output import CERTIFICATE
 from chronoscene.scene import Scene
 from chronoscene.scene.similarity import SIGMA
 
-CERTIFICATE = "registration.json"
 CONFIDENCE = 1.96  # Standard deviations of a 95 % interval
 ONE_SIGMA = 0.683  # Share of normal numbers within one standard deviation
 MIN_STABLE = 1000  # Cells of stable ground from which a variogram is estimated

@@ -17,6 +17,7 @@ from chronoscene.arrays import Array, Ints
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.cameras import Viewpoint
+from chronoscene.harness.use.changes import surface_depth
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import evaluation_size, resize_camera
 from chronoscene.methods import Prediction
@@ -52,10 +53,10 @@ def solid_depth(prediction: Prediction) -> NDArray[np.float32]:
             found="one that does not",
             todo="open a run of another method",
         )
-    solid = prediction.depth > 0
+    depth = surface_depth(prediction)
     if prediction.alpha is not None:
-        solid &= prediction.alpha >= MIN_ALPHA
-    return np.where(solid, prediction.depth, np.float32(np.inf)).astype(np.float32)
+        depth[~(prediction.alpha >= MIN_ALPHA)] = np.inf
+    return depth.astype(np.float32)
 
 
 def depth_views(run: TrainedRun, scene: Scene, period: int) -> Iterator[DepthView]:

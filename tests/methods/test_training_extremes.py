@@ -18,8 +18,8 @@ def one_thread():
 
 
 SHARE = 3
-"""Of so many pairs of extreme and method, one is tested by default: each method meets a share of
-the extremes, each extreme a share of the methods."""
+"""Pairs of extreme and method of which one is tested by default: each method meets a share
+of the extremes, each extreme a share of the methods."""
 
 
 def pairs():

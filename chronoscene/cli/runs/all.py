@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import EXISTING_FILE, PATH, add_options
+from chronoscene.cli.options import PATH, TABLE, add_options
 from chronoscene.cli.output import check_place, report_written, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.runs.bench import BUDGET, WIDTH
@@ -18,11 +18,7 @@ from chronoscene.workflow.steps import Project
 @click.command("all")
 @click.argument("captures", type=PATH)
 @click.argument("out", type=PATH)
-@click.option(
-    "--table",
-    type=EXISTING_FILE,
-    help="CSV with the columns image and period; paths are relative to CAPTURES.",
-)
+@TABLE
 @add_options("preset")
 @BUDGET
 @WIDTH

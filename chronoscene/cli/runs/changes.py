@@ -22,6 +22,15 @@ from chronoscene.harness.use.trained_run import TrainedRun, open_run
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import boxed_text
 
+BETWEEN = click.option(
+    "--between",
+    nargs=2,
+    multiple=True,
+    metavar="PERIOD PERIOD",
+    help="Compare these two periods (numbers or labels); may be repeated.  [default: all pairs of "
+    f"up to {ALL_PAIRS} periods; of more, each with the next]",
+)
+
 
 @click.command("changes")
 @RUN
@@ -31,14 +40,7 @@ from chronoscene.io.tables import boxed_text
     required=True,
     help="New folder for the point clouds, the picture and the table.",
 )
-@click.option(
-    "--between",
-    nargs=2,
-    multiple=True,
-    metavar="PERIOD PERIOD",
-    help="Compare these two periods (numbers or labels); may be repeated.  [default: all pairs of "
-    f"up to {ALL_PAIRS} periods; of more, each with the next]",
-)
+@BETWEEN
 @SCENE
 @PLUGIN
 @DEVICE

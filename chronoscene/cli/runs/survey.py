@@ -11,6 +11,7 @@ import click
 from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE
 from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
 from chronoscene.cli.progress import announce, progress_bar
+from chronoscene.cli.runs.changes import BETWEEN
 from chronoscene.cli.scenes.reading import read_and_note
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RUN_FILE
@@ -25,14 +26,7 @@ from chronoscene.survey.products import SurveyOptions, check_packages, write_sur
 @click.command("survey")
 @click.argument("source", metavar="RUN|SCENE", type=FOLDER)
 @click.option("--out", type=FOLDER, required=True, help="New folder for the products.")
-@click.option(
-    "--between",
-    nargs=2,
-    multiple=True,
-    metavar="PERIOD PERIOD",
-    help="Compare these two periods (numbers or labels); may be repeated.  [default: all pairs of "
-    "up to 4 periods; of more, each with the next]",
-)
+@BETWEEN
 @click.option(
     "--resolution",
     type=click.FloatRange(min=0, min_open=True),

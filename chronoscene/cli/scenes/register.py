@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import EXISTING_FILE, PATH
+from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE
 from chronoscene.cli.output import check_place, emit, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
@@ -27,11 +27,7 @@ FAILED = 1  # Exit status if a verdict is fail
 @click.command("register")
 @click.argument("captures", type=PATH)
 @click.argument("out", type=PATH)
-@click.option(
-    "--table",
-    type=EXISTING_FILE,
-    help="CSV with the columns image and period; paths are relative to CAPTURES.",
-)
+@TABLE
 @click.option(
     "--into",
     "scene",
