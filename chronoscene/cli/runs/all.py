@@ -27,9 +27,9 @@ def command(captures: Path, out: Path, table: Path | None, **options: Any) -> No
 
     CAPTURES is what register takes: for example, a folder with a subfolder of photos for each
     period. The photos are registered, the scene is checked, ChronoGS is trained on it, and the
-    model is made into a page to walk through and exported. OUT/index.html links everything. The
-    same command continues a run that was stopped; where photos or options have changed, it makes
-    anew what follows from them.
+    model is made into a page to walk through, exported, and surveyed. OUT/index.html links
+    everything. The same command continues a run that was stopped; where photos or options have
+    changed, it makes anew what follows from them.
 
     The training is not begun if the alignment of the periods fails. Exit status: 0 if all steps are
     done or were skipped for a reason, 2 if one fails.
