@@ -16,7 +16,7 @@ from chronoscene.kernels import runtime
 
 # How long an example takes is not a property of the code on a machine that others use too. What is
 # drawn is the same in every run, unless --hypothesis-profile=afresh asks for other draws.
-settings.register_profile("fixed", deadline=None, derandomize=True, database=None)
+settings.register_profile("fixed", deadline=None, derandomize=True, database=None, max_examples=50)
 settings.register_profile("afresh", deadline=None, derandomize=False)
 settings.load_profile("fixed")
 
@@ -61,6 +61,14 @@ def write_model(model: pycolmap.Reconstruction, folder: Path, form: str) -> None
     if form == "old":
         (folder / "rigs.bin").unlink()
         (folder / "frames.bin").unlink()
+
+
+@pytest.fixture
+def runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Benches in the test process."""
+    from training_here import train_here
+
+    train_here(monkeypatch)
 
 
 @pytest.fixture

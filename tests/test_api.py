@@ -59,7 +59,7 @@ def in_folder(make_scene_folder, tmp_path, monkeypatch):
     return folder
 
 
-def test_the_blocks_of_the_guide_run(in_folder, capsys):
+def test_the_blocks_of_the_guide_run(in_folder, capsys, runs_here):
     text = GUIDE.read_text()
     assert "iterations=1000" in text
     blocks = re.findall(r"```python\n(.*?)```", text.replace("=1000", "=6"), re.DOTALL)

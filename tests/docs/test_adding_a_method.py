@@ -3,13 +3,11 @@
 import ast
 import dataclasses
 import importlib
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from command_line import run_command
 
 from chronoscene import methods
 from chronoscene.harness.contract import CHECKS
@@ -37,18 +35,13 @@ def smaller(text):
 
 
 @pytest.mark.parametrize("package", ["voxel_field", "tinted_gaussians"])
-def test_the_packages_on_the_page_keep_all_rules(package, tmp_path):
+def test_the_packages_on_the_page_keep_all_rules(package, tmp_path, monkeypatch):
     (tmp_path / package).mkdir()
     for name in (f"{package}/__init__.py", f"{package}/method.py"):
         (tmp_path / name).write_text(smaller(SHOWN[name]))
-    done = subprocess.run(
-        [sys.executable, "-m", "chronoscene", "check-method", f"{package}:SPEC"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    monkeypatch.syspath_prepend(tmp_path)
+    done = run_command("check-method", f"{package}:SPEC")
+    assert done.exit_code == 0, done.output
     assert f"{package}:SPEC: 0 of {len(CHECKS)} rules broken" in done.stdout
 
 

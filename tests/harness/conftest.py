@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from training_here import execute_here, train_here
 
 from chronoscene.formats import chronoscene as scene_format
-from chronoscene.harness.files.records import Failure, read_run
-from chronoscene.harness.plan.job import Job
+from chronoscene.harness.files.records import read_run
 from chronoscene.harness.plan.settings import bench_settings
-from chronoscene.harness.run.process import put_in_place, run_in_process, staged
+from chronoscene.harness.run.process import run_in_process
 from chronoscene.harness.run.runner import BenchOutcome, run_bench
-from chronoscene.harness.train.worker import execute
-from chronoscene.kernels.runtime import set_threads
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 
 PLUGINS = Path(__file__).parent / "plugins"
@@ -159,20 +157,10 @@ def bench(scene_folder: Path, tmp_path: Path) -> Bench:
     return run
 
 
-def execute_here(job: Job) -> Failure | None:
-    """A job in this process, which costs no time to start."""
-    with staged(job) as job:
-        try:
-            execute(job.document(), lambda *progress: None)
-        finally:
-            set_threads(None)
-    return put_in_place(job, Path(job.staging))
-
-
 @pytest.fixture
 def bench_here(scene_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     """The same of any method in this process, not warmed up."""
-    monkeypatch.setattr("chronoscene.harness.train.worker.warm_up", lambda *args, **options: None)
+    train_here(monkeypatch)
 
     def run(*methods: str, **changes: Any) -> tuple[BenchOutcome, list[str]]:
         said: list[str] = []
@@ -182,7 +170,7 @@ def bench_here(scene_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
             "runs": tmp_path / "runs",
         }
         settings = bench_settings(**{**fields, **changes})
-        return run_bench(settings, said.append, execute=execute_here), said
+        return run_bench(settings, said.append), said
 
     return run
 
@@ -224,12 +212,12 @@ def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
     runs, finished = tmp_path_factory.mktemp("trained"), []
     common: dict[str, Any] = {"scenes": (scene_folder,), "runs": runs, "preset": "fast"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("chronoscene.harness.train.worker.warm_up", lambda *args, **options: None)
+        train_here(patch)
         for methods, strategy in ((("chronogs", "3dgs-period"), "joint"), (("4dgs",), "separate")):
             settings = bench_settings(
                 **common, methods=methods, strategies=(strategy,), iterations=12
             )
-            finished += run_bench(settings, lambda line: None, execute=execute_here).finished
+            finished += run_bench(settings, lambda line: None).finished
     return {read_run(folder).method: folder for folder in finished}
 
 

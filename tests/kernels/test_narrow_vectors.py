@@ -53,6 +53,7 @@ def run_narrow(lanes: str, tests: tuple[str, ...], cache: Path) -> None:
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-1000:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes", NARROWER)
 def test_narrow_vectors_agree(lanes: str, pytestconfig: pytest.Config, tmp_path: Path) -> None:
     if int(lanes.split()[0]) == LANES:

@@ -76,7 +76,10 @@ def test_any_number_of_channels(
     )
 
 
-@pytest.mark.parametrize(("count", "width", "height"), [(9_000, 70, 50), (60_000, 96, 64)])
+@pytest.mark.parametrize(
+    ("count", "width", "height"),
+    [(9_000, 70, 50), pytest.param(60_000, 96, 64, marks=pytest.mark.slow)],
+)
 def test_lists_of_several_parts(
     count: int, width: int, height: int, tools: SimpleNamespace, check_agreement: Check
 ) -> None:

@@ -232,7 +232,7 @@ def check_mixture(scene: SmallScene, tolerances: ModuleType) -> None:
     assert_close(of_both(compare(scene)), of_both(rounding(scene)), tolerances, mixture=True)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(scene=extreme_scenes())
 def test_any_mixture_of_extremes(scene: SmallScene, tolerances: ModuleType) -> None:
     check_mixture(scene, tolerances)

@@ -123,7 +123,13 @@ def test_progress_counts_to_the_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"off_centre": True}, {"kind": "street"}, {"rebuilt": 1.0}, {"noise": 0.5}, {"periods": 1}],
+    [
+        {"kind": "street", "off_centre": True, "noise": 0.5},
+        *(
+            pytest.param(change, marks=pytest.mark.slow)
+            for change in ({"off_centre": True}, {"rebuilt": 1.0}, {"noise": 0.5}, {"periods": 1})
+        ),
+    ],
     ids=str,
 )
 def test_the_validator_has_nothing_to_say(tmp_path: Path, change: dict[str, Any]) -> None:

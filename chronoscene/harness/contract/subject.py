@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -83,6 +84,11 @@ class Subject:
         method.save_training(folder)
         return folder
 
+    @cached_property
+    def elsewhere(self) -> Path:
+        """Folder of `train_elsewhere`."""
+        return train_elsewhere([self.name], self.folder())
+
     def folder(self) -> Path:
         """Make an empty folder."""
         return Path(mkdtemp(dir=self.scratch))
@@ -150,6 +156,22 @@ def tensors_of(folder: Path) -> dict[str, NDArray[Any]]:
     """Read the tensors of a saved model, by name."""
     with safe_open(folder / "model.safetensors", framework="numpy") as tensors:
         return {key: tensors.get_tensor(key) for key in tensors.keys()}  # noqa: SIM118
+
+
+def train_elsewhere(names: Sequence[str], folder: Path) -> Path:
+    """Train methods in one other process, with another hash seed and with renderings in between.
+
+    Returns:
+        The folder: models in ``out``, by name; in ``cwd`` and ``tmp`` what else was written.
+    """
+    for name in ("out", "cwd", "tmp"):
+        (folder / name).mkdir()
+    done = python(
+        "-m", "chronoscene.harness.contract.tiny_training", str(folder / "out"), *names,
+        cwd=folder / "cwd", PYTHONHASHSEED="77", TMPDIR=str(folder / "tmp"),
+    )  # fmt: skip
+    demand(done.returncode == 0, "training in another process", "success", done.stderr.strip())
+    return folder
 
 
 def python(

@@ -1,6 +1,7 @@
 """Short trainings on painted balls.
 
-``python -m chronoscene.harness.contract.tiny_training METHOD OUT`` trains in a process of its own.
+``python -m chronoscene.harness.contract.tiny_training OUT METHOD ...`` trains in a process of its
+own and saves each model in a folder of OUT with the name of its method.
 """
 
 from __future__ import annotations
@@ -116,10 +117,13 @@ def train(
 
 
 def main() -> None:
-    """Train, probing, and save."""
-    spec, out = load_spec(sys.argv[1]), Path(sys.argv[2])
-    method, _ = train(spec, make_training_set(periods_for(spec)), probe=True)
-    method.save(out)
+    """Train methods, probing, and save them."""
+    out = Path(sys.argv[1])
+    for name in sys.argv[2:]:
+        spec = load_spec(name)
+        method, _ = train(spec, make_training_set(periods_for(spec)), probe=True)
+        (out / spec.name).mkdir()
+        method.save(out / spec.name)
 
 
 if __name__ == "__main__":

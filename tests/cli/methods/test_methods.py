@@ -46,7 +46,7 @@ def test_ten_options_come_first(name):
     assert first == list(spec.main_options) and len(first) == 10 and first[0] == "iterations"
 
 
-def test_finished_runs_say_what_a_method_costs(monkeypatch, tmp_path, make_scene_folder):
+def test_finished_runs_say_what_a_method_costs(monkeypatch, tmp_path, make_scene_folder, runs_here):
     monkeypatch.setitem(sys.modules, "toy_methods", None)
     monkeypatch.delitem(sys.modules, "toy_methods")
     monkeypatch.chdir(PLUGINS)

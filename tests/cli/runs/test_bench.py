@@ -31,7 +31,7 @@ def chronoscene(*arguments):
         return run_command(*arguments)
 
 
-def test_bench_score_and_table(make_scene_folder, tmp_path):
+def test_bench_score_and_table(make_scene_folder, tmp_path, runs_here):
     scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
     runs = tmp_path / "runs"
     done = chronoscene(

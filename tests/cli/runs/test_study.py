@@ -24,7 +24,7 @@ set = { rate = 0.5 }
 """
 
 
-def test_a_study_of_ones_own(make_scene_folder, tmp_path):
+def test_a_study_of_ones_own(make_scene_folder, tmp_path, runs_here):
     scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
     file, runs = tmp_path / "rates.toml", tmp_path / "runs"
     file.write_text(STUDY)

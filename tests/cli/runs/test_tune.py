@@ -7,7 +7,7 @@ import pytest
 from .test_bench import IMAGES, TESTS, chronoscene
 
 
-def test_a_search_and_its_preset(make_scene_folder, tmp_path):
+def test_a_search_and_its_preset(make_scene_folder, tmp_path, runs_here):
     pytest.importorskip("optuna")
     scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
     out, runs = tmp_path / "tuned", tmp_path / "runs"

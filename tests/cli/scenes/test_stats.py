@@ -22,6 +22,14 @@ from chronoscene.io.tables import FORMATS
 from chronoscene.statistics.counts import PAPER_COUNTS, PeriodCount, SceneCount
 
 
+@pytest.fixture
+def one_process(monkeypatch):
+    """Scenes are read here: starting processes takes longer than tiny scenes do."""
+    monkeypatch.setattr(
+        "chronoscene.cli.scenes.stats.map_parallel", lambda f, items, lost: map(f, items)
+    )
+
+
 def run(*args: object):
     return CliRunner().invoke(cli, ["stats", *map(str, args)])
 
@@ -45,7 +53,7 @@ def test_without_a_folder_the_current_one_or_data(make_scene_folder, tmp_path, m
     assert len({result.stdout for result in results}) == 1 and "place" in results[0].stdout
 
 
-def test_a_folder_of_scenes_and_several_folders(make_scene_folder, tmp_path):
+def test_a_folder_of_scenes_and_several_folders(make_scene_folder, tmp_path, one_process):
     make_scene_folder(name="set/b")
     make_scene_folder({"1.png": 0, "2.png": 1, "3.png": 2}, name="set/a")
     single = make_scene_folder(name="single")
@@ -153,7 +161,9 @@ def test_several_scenes_are_read_in_several_processes(make_scene_folder, tmp_pat
 
 
 @pytest.mark.parametrize("layout", ["full", "paper"])
-def test_a_scene_that_cannot_be_read_does_not_cost_the_others(make_scene_folder, tmp_path, layout):
+def test_a_scene_that_cannot_be_read_does_not_cost_the_others(
+    make_scene_folder, tmp_path, layout, one_process
+):
     folders = [make_scene_folder(name=f"set/{i}") for i in range(3)]
     (folders[1] / "sparse/split.txt").write_text("a/0001.png\n")
     out = tmp_path / "out"
@@ -178,7 +188,9 @@ def test_a_scene_that_cannot_be_read_does_not_cost_the_others(make_scene_folder,
     assert len(done.stderr.splitlines()) == 4
 
 
-def test_a_scene_that_is_not_known_as_one_is_not_left_out_in_silence(make_scene_folder, tmp_path):
+def test_a_scene_that_is_not_known_as_one_is_not_left_out_in_silence(
+    make_scene_folder, tmp_path, one_process
+):
     for name in "abc":
         make_scene_folder({"1.png": 0, "2.png": 1}, name=f"set/{name}")
     (tmp_path / "set/b/sparse/split.txt").unlink()
@@ -200,7 +212,7 @@ def test_out_is_looked_at_before_the_work(make_scene_folder, tmp_path, monkeypat
         assert isinstance(run(folder, "--out", out).exception, ConfigError)
 
 
-def test_counts_are_compared_with_those_of_the_paper(tmp_path):
+def test_counts_are_compared_with_those_of_the_paper(tmp_path, one_process):
     paper = PAPER_COUNTS["Lawncourt"]
     write_skeleton(tmp_path / "lawncourt", [(a, b // 100) for a, b in paper])
     write_skeleton(tmp_path / "other", [(3, 10)])
@@ -228,7 +240,7 @@ def test_what_is_said_about_the_paper():
     assert not list(against_paper([counted("Elsewhere", rest)]))
 
 
-def test_scenes_of_the_paper_are_in_its_order(make_scene_folder, tmp_path):
+def test_scenes_of_the_paper_are_in_its_order(make_scene_folder, tmp_path, one_process):
     for name in ("Aerial1", "Lawncourt", "Zoo", "Canteen", "Abbey"):
         make_scene_folder(name=f"set/{name}")
     data = json.loads(run(tmp_path / "set", "--format", "json").stdout)
@@ -249,7 +261,7 @@ def test_names_that_are_not_text(make_scene_folder, tmp_path):
     assert len(list(out.iterdir())) == 3
 
 
-def test_figures_and_pages_of_every_scene(make_scene_folder, tmp_path):
+def test_figures_and_pages_of_every_scene(make_scene_folder, tmp_path, one_process):
     folders = [make_scene_folder(name=name) for name in ("one/place", "two/place", "hill")]
     out = tmp_path / "out" / "deep"
     options = ["--figures", out, "--figure-format", "svg", "--cameras", "--pages", out / "pages"]

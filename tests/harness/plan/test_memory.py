@@ -159,7 +159,7 @@ def test_a_full_disk_is_refused_with_a_smaller_setting(make_scene, settings, fre
     room(scene, settings, runs=2)
 
 
-def test_bench_says_it_and_refuses_before_anything_is_written(bench, tmp_path):
+def test_bench_says_it_and_refuses_before_anything_is_written(bench, tmp_path, runs_here):
     _, said = bench("MEAN")
     assert any(line.startswith("ring: 5 training photos, 0.00 GB when") for line in said)
     _, said = bench("MEAN", photo_memory=1)  # finished: needs no photos

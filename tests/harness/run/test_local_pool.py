@@ -37,6 +37,7 @@ def test_results_do_not_depend_on_how_many_run_at_a_time(bench, bench_here, tmp_
     assert said[-1].endswith(" runs/h, 0:00 left")
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_all_runs(bench, tmp_path):
     with pytest.raises(DiskFullError, match=r"full-disk-joint-balanced/seed0: expected space for"):
         bench("MEAN", "FULL_DISK", jobs=2, overrides={"mean.sleep": "60"})
@@ -112,7 +113,9 @@ run_bench(settings, print)
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
+)
 def test_all_runs_end_with_their_bench(number, scene_folder, tmp_path, monkeypatch):
     runs = tmp_path / "runs"
     monkeypatch.setenv("TOY_HOLD", f"0:{scene_folder}")  # for ever

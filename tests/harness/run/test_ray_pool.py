@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
+from training_here import execute_here
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import read_run
@@ -18,7 +19,6 @@ from chronoscene.harness.run import ray_pool
 from chronoscene.harness.run.runner import run_bench
 from chronoscene.io.processes import process_tree
 
-from ..conftest import execute_here
 from ..plan.test_job import JOB
 from ..train.test_interruption import wait_for
 
@@ -206,6 +206,7 @@ def test_without_ray_or_a_cluster(scene_folder, tmp_path, monkeypatch):
     assert not list(tmp_path.rglob("*.token"))
 
 
+@pytest.mark.slow
 def test_runs_get_what_the_machines_of_a_cluster_have(tmp_path):
     machines = [{"CPU": 16.0, "GPU": 1.0}, {"CPU": 6.0}, {"memory": 1.0}]
     nodes = [{"Alive": True, "Resources": machine} for machine in machines]

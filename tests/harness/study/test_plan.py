@@ -4,6 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from training_here import execute_here
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import read_run
@@ -16,8 +17,6 @@ from chronoscene.harness.study.plan import (
     run_study,
 )
 from chronoscene.methods import build_config, load_spec
-
-from ..conftest import execute_here
 
 TWO_ROWS = """
 title = "Rates"

@@ -79,7 +79,9 @@ def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_pat
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_an_interrupted_bench_leaves_no_process_and_no_half_run(
     number, scene_folder, tmp_path, monkeypatch
 ):
@@ -110,7 +112,9 @@ def test_an_interrupted_bench_leaves_no_process_and_no_half_run(
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL]
+)
 def test_a_program_that_a_bench_runs_ends_with_it(number, scene_folder, tmp_path):
     """It is in a session of its own; after SIGKILL, the worker notices that its bench is gone."""
     runs, hold = tmp_path / "runs", tmp_path / "hold"

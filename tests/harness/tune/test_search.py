@@ -7,6 +7,7 @@ import tomllib
 from dataclasses import replace
 
 import pytest
+from training_here import execute_here
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import read_run
@@ -14,8 +15,6 @@ from chronoscene.harness.plan.settings import bench_settings
 from chronoscene.harness.tune.report import best_of
 from chronoscene.harness.tune.search import tune
 from chronoscene.methods import build_config, load_spec
-
-from ..conftest import execute_here
 
 pytest.importorskip("optuna")
 
@@ -62,7 +61,7 @@ def test_a_method_of_the_package(search):
     assert [r.number for r in first if r.psnr is not None] == [0, 1, 2]
 
 
-@pytest.mark.parametrize("failing", [1, 4])
+@pytest.mark.parametrize("failing", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_an_interrupted_search_goes_on_where_it_was(search, failing):
     """Before, and after, the run of a trial has its result."""
     whole = search("whole", 14)

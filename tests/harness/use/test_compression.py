@@ -137,6 +137,7 @@ def test_a_run_in_stages_is_refused(copied):
         compress_run(staged, run.scene(), max_loss=None, log=print)
 
 
+@pytest.mark.slow
 def test_a_loss_that_half_floats_exceed_is_refused(copied, monkeypatch):
     monkeypatch.setattr("chronoscene.harness.use.compression.MIN_ROWS", 4)
     falling = count(30, -1)

@@ -40,7 +40,7 @@ def test_an_opened_run_renders_its_predictions(runs, strategy):
 
 
 def test_a_run_of_gaussians_renders_its_predictions_with_depth_in_world_units(
-    scene_folder, tmp_path
+    scene_folder, tmp_path, runs_here
 ):
     """The camera, pose and training frame matter here, unlike to a method of one colour."""
     settings = bench_settings(

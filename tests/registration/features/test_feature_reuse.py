@@ -200,6 +200,7 @@ def check(photos: Path, tmp_path: Path, from_scratch: Callable[..., Any]) -> Cal
     return same_as_from_scratch
 
 
+@pytest.mark.slow
 def test_the_number_of_threads_changes_nothing(
     photos: Path, tmp_path: Path, check: Callable[..., None]
 ) -> None:
@@ -208,6 +209,7 @@ def test_the_number_of_threads_changes_nothing(
     check(work, ALL)
 
 
+@pytest.mark.slow
 def test_nothing_of_another_extractor_is_reused(
     photos: Path, tmp_path: Path, check: Callable[..., None]
 ) -> None:

@@ -113,7 +113,18 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+ALIKE = (
+    "turned over",
+    "by GPS, few matches",
+    "few matches in one spot",
+    "one step of a repetition",
+)
+"""Cases that others resemble."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ALIKE else n for n in CASES]
+)
 def test_no_wrong_registration_passes(name: str) -> None:
     settings = CaseSettings(**({"ties": 400, "seed": 31, "points": 2500} | CASES[name]))
     made = generate_case(settings)

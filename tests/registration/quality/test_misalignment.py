@@ -130,6 +130,7 @@ def test_a_gross_error_is_found_as_well(exact: Generated) -> None:
     assert found.rotation.low > 39
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth() -> None:
     """The upper bound must hold in nearly all cases; it is what a pass rests on."""
     hits, tries = 0, 20

@@ -97,6 +97,7 @@ def test_unknown_preset() -> None:
         preset("demmo")
 
 
+@pytest.mark.slow
 def test_cameras_keep_their_distance(made, renderers) -> None:  # type: ignore[no-untyped-def]
     """In no period is a camera inside of an object or right before one."""
     for frame in made.scene.frames:

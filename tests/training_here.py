@@ -1,0 +1,31 @@
+"""Runs of a bench in the test process, where nothing is said about processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from chronoscene.harness.files.records import Failure
+from chronoscene.harness.plan.job import Job
+from chronoscene.harness.run.process import put_in_place, staged
+from chronoscene.harness.train.worker import execute
+from chronoscene.kernels.runtime import set_threads
+
+
+def execute_here(job: Job) -> Failure | None:
+    """A job in this process, which costs no time to start."""
+    with staged(job) as job:
+        try:
+            execute(job.document(), lambda *progress: None)
+        finally:
+            set_threads(None)
+    return put_in_place(job, Path(job.staging))
+
+
+def train_here(patch: pytest.MonkeyPatch) -> None:
+    """Let all benches that run one job at a time do so in this process, not warmed up."""
+    for module in ("runner", "local_pool"):
+        name = f"chronoscene.harness.run.{module}.run_in_process"
+        patch.setattr(name, lambda job, **options: execute_here(job))
+    patch.setattr("chronoscene.harness.train.worker.warm_up", lambda *args, **options: None)
