@@ -25,7 +25,5 @@ def execute_here(job: Job) -> Failure | None:
 
 def train_here(patch: pytest.MonkeyPatch) -> None:
     """Let all benches that run one job at a time do so in this process, not warmed up."""
-    for module in ("runner", "local_pool"):
-        name = f"chronoscene.harness.run.{module}.run_in_process"
-        patch.setattr(name, lambda job, **options: execute_here(job))
+    patch.setattr("chronoscene.harness.run.runner.run_in_process", execute_here)
     patch.setattr("chronoscene.harness.train.worker.warm_up", lambda *args, **options: None)

@@ -3,12 +3,16 @@
 import json
 
 import pytest
+from training_here import execute_here
+
+from chronoscene.harness.run import local_pool
 
 from .test_bench import IMAGES, TESTS, chronoscene
 
 
-def test_a_search_and_its_preset(make_scene_folder, tmp_path, runs_here):
+def test_a_search_and_its_preset(make_scene_folder, tmp_path, runs_here, monkeypatch):
     pytest.importorskip("optuna")
+    monkeypatch.setattr(local_pool, "run_in_process", lambda job, **options: execute_here(job))
     scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
     out, runs = tmp_path / "tuned", tmp_path / "runs"
     call = ("tune", "toy_methods:TUNED", scene, "--iterations", 12, "--threads", 1, "--out", out)
