@@ -203,7 +203,8 @@ def examine(
 
 def _scenes(folder: Path, request: StatsRequest) -> list[Path]:
     """Find the scenes of a folder, and folders that look like one, so that none is overlooked."""
-    found = find_scenes(folder, format=request.dataset_format, period_by=request.period_by)
+    scenes = find_scenes(folder, format=request.dataset_format, period_by=request.period_by)
+    found = [scene.path for scene in scenes]
     if found == [folder]:
         return found
     beside = {p for name in SCENE_PARTS for p in folder.glob(f"*/{name}") if p.is_dir()}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from chronoscene.formats import read_scene
+from chronoscene.formats import DetectedFormat
 from chronoscene.harness.files.records import SOURCE_FILE, read_document
 from chronoscene.scene import Scene
 
@@ -45,19 +45,17 @@ def read_source(folder: Path) -> RunSource:
     )
 
 
-def read_bench_scene(
-    root: Path, *, format: str | None, period_by: str | None, validation: bool
-) -> Scene:
+def read_bench_scene(found: DetectedFormat, *, validation: bool) -> Scene:
     """Read a scene as runs have it: bench, its workers, and whoever opens a run later.
 
     Args:
-        root: As ``format`` and ``period_by``, for `read_scene`.
+        found: Folder of the scene, with its format.
         validation: True for the training views alone, some of which are test views.
 
     Raises:
         SceneError: If the scene cannot be read, or has too few views for validation.
     """
-    scene = read_scene(root, format=format, period_by=period_by)
+    scene = found.read()
     if validation:
         from chronoscene.scene.split_making import hold_out_validation  # scipy takes time to load
 

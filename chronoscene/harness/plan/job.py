@@ -40,6 +40,8 @@ class Job:
     seed: int
     settings: RunSettings
     """The overrides are those of this method."""
+    period_by: str | None = None
+    """Rule by which the images of the scene are grouped into periods, as for `read_scene`."""
     notices: list[str] = field(default_factory=list)
     staging: str = ""
     """Folder that the worker writes; renamed to `folder` when it has ended."""
@@ -115,7 +117,7 @@ class Job:
             plugin_path=self.plugin_path,
             scene_root=self.scene_root,
             scene_format=self.scene_format,
-            period_by=self.settings.period_by,
+            period_by=self.period_by,
             validation=self.settings.validation,
             training_from_world=training_from_world.to_matrix().tolist(),
         )

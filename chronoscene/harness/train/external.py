@@ -150,7 +150,7 @@ def _run_part(
         usage = execute(runner.train)
         peaks = [usage.peak_memory_bytes, *(execute(c).peak_memory_bytes for c in runner.render)]
         images = _find_images(runner, output, part.test, names, values)
-        add_images(writer, part.test, images, part.store)
+        add_images(writer, part.test, images, job.settings.max_width)
         primitives = _keep_model(job, runner, output, part, values)
     finally:
         shutil.rmtree(work, ignore_errors=True)

@@ -140,16 +140,14 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
             found=str(error),
             todo="pip install 'chronoscene[tune]'",
         ) from error
-    settings = replace(settings, run=replace(settings.run.absolute(), validation=True))
+    settings = replace(settings, run=replace(settings.run, validation=True))
     (reference,), (seed,), run = settings.methods, settings.seeds, settings.run
     method = resolve_method(reference, load_spec(reference), run)
     start = starting_point(method.spec, method.config)
     scenes = []
-    for path in settings.scenes:
-        log(f"read {path}")
-        scene = read_bench_scene(
-            path, format=settings.dataset_format, period_by=run.period_by, validation=True
-        )
+    for found in settings.scenes:
+        log(f"read {found.path}")
+        scene = read_bench_scene(found, validation=True)
         scenes.append({"name": scene.name, "hash": scene_hash(scene)})
     ours = {
         "method": method.spec.name,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
+from chronoscene.formats import detect
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.records import (
@@ -320,12 +321,8 @@ class TrainedRun:
         place, found = root or Path(self.source.scene_root), "nothing"
         if place.exists():
             source = self.source
-            scene = read_bench_scene(
-                place,
-                format=source.scene_format,
-                period_by=source.period_by,
-                validation=source.validation,
-            )
+            detected = detect(place, format=source.scene_format, period_by=source.period_by)
+            scene = read_bench_scene(detected, validation=source.validation)
             if scene_hash(scene) == self.record.scene_hash:
                 return scene
             found = "another scene, or a changed one"
