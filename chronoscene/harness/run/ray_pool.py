@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import chronoscene
+from chronoscene.checks import import_extra
 from chronoscene.errors import BackendError, ChronoSceneError, ConfigError
 from chronoscene.harness.files import records
 from chronoscene.harness.files.provenance import code_version
@@ -77,15 +78,7 @@ def open_ray(settings: BenchSettings) -> Iterator[RayPool]:
         ConfigError: If there is no Ray, or no cluster.
     """
     option = f"--ray {settings.ray}"
-    try:
-        import ray
-    except ImportError as error:
-        raise ConfigError(
-            option,
-            expected="the package ray",
-            found=str(error),
-            todo="pip install 'chronoscene[ray]'",
-        ) from error
+    ray = import_extra("ray", "ray", option)
     try:
         host, _, port = str(settings.ray).removeprefix("ray://").rpartition(":")
         if port.isdigit():  # Ray itself tries for over a minute

@@ -11,6 +11,7 @@ import warnings
 from contextlib import redirect_stdout
 from typing import TYPE_CHECKING
 
+from chronoscene.checks import import_extra
 from chronoscene.errors import ConfigError
 from chronoscene.harness.view.content import Content
 from chronoscene.harness.view.panel import Viewer
@@ -67,15 +68,7 @@ class ViewServer:
         Raises:
             ConfigError: If viser is missing.
         """
-        try:
-            import viser
-        except ImportError as error:
-            raise ConfigError(
-                "chronoscene view",
-                expected="the package viser",
-                found=str(error),
-                todo="pip install 'chronoscene[view]'",
-            ) from error
+        viser = import_extra("viser", "view", "chronoscene view")
         self.viewers: dict[int, Viewer] = {}
         """Browsers that are connected, by their number."""
         self._content = content
