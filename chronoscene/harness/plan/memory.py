@@ -12,10 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chronoscene.errors import ConfigError
-from chronoscene.formats import detect
 from chronoscene.harness.files.records import PHOTOS
-from chronoscene.harness.files.source import read_bench_scene
-from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.settings import RunSettings
 from chronoscene.images.disk_cache import DiskCache, files_of
 from chronoscene.images.store import ImageStore, decoded_bytes, evaluation_size
@@ -113,12 +110,6 @@ def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
         decoders=needs.decoders,
         disk=disk,
     )
-
-
-def read_scene_of(job: Job) -> Scene:
-    """Read the scene of a job."""
-    found = detect(Path(job.scene_root), format=job.scene_format, period_by=job.period_by)
-    return read_bench_scene(found, validation=job.settings.validation)
 
 
 def check_room(needs: PhotoNeeds, folder: Path, runs: int, *, here: bool = True) -> str:

@@ -8,6 +8,7 @@ from itertools import chain, product
 from pathlib import Path
 
 from chronoscene.harness.files.ground_truth import freeze_ground_truth
+from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.checks import check_run
 from chronoscene.harness.plan.finished import continued, is_to_do
@@ -64,19 +65,22 @@ def _runs_of_scene(
             notices.append(BUDGET_NOTICE)
         own = replace(own, keep_training=own.keep_training or settings.continue_to is not None)
         job = Job(
-            scene_root=str(scene.content.root.resolve()),
-            scene_format=scene.content.format,
+            origin=RunOrigin(
+                method=method.reference,
+                plugin_path=str(Path.cwd()) if ":" in method.reference else None,
+                scene_root=str(scene.content.root.resolve()),
+                scene_format=scene.content.format,
+                period_by=scene.period_by,
+                validation=own.validation,
+            ),
             scene=scene.content.name,
             scene_hash=scene.hash,
             split_hash=scene.split_hash,
-            method=method.reference,
             method_name=method.spec.name,
             strategy=strategy,
             seed=seed,
             settings=own,
-            period_by=scene.period_by,
             notices=notices,
-            plugin_path=str(Path.cwd()) if ":" in method.reference else None,
             memory=settings.job_memory or scene.needs.of_run,
         )
         run = method.run(job)

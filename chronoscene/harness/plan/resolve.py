@@ -181,7 +181,7 @@ def resolve_method(reference: str, spec: MethodSpec, settings: RunSettings) -> R
 
 def resolve(job: Job) -> ResolvedRun:
     """Resolve a planned job in the process that runs it."""
-    spec = load_spec(job.method)
+    spec = load_spec(job.origin.method)
     return ResolvedRun.of(job, spec, _config(spec, job.settings))
 
 

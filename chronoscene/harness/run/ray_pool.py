@@ -206,7 +206,8 @@ class RayPool:
         """Return True if a job gets a GPU: one that asks for it, or can use it where one is."""
         if job.settings.device != "auto":
             return job.settings.device == "cuda"
-        return "cuda" in load_spec(job.method).devices and any("GPU" in m for m in self._machines)
+        has_gpu = any("GPU" in machine for machine in self._machines)
+        return has_gpu and "cuda" in load_spec(job.origin.method).devices
 
     def _reason(self, error: Exception) -> str:
         """Return the reason why a run has no result."""

@@ -81,7 +81,7 @@ class ViewServer:
         self.port = self._server.get_port()
         """Another one than asked for if that was taken in the meantime."""
         # Any browser can ask viser for a public address, through a machine of others.
-        self._server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
+        self._server.request_share_url = lambda verbose=True: None
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         camera = self._server.initial_camera
         camera.position, camera.look_at, up = content.start()
