@@ -130,6 +130,11 @@ class ImageStore:
         self._decoders = ThreadPoolExecutor(decoders, "decoder")
         self._coming: dict[str, Future[Photo]] = {}
 
+    @property
+    def cached_bytes(self) -> int:
+        """Bytes in the cache."""
+        return self._bytes
+
     def camera(self, frame: Frame) -> Camera:
         """Return the camera of a frame at the evaluation size."""
         return resize_camera(frame.camera, *evaluation_size(*frame.camera.size, self._max_width))
