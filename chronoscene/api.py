@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ChronoSceneError, SceneError
-from chronoscene.formats import find_scenes, read_scene
+from chronoscene.formats import read_scene
 from chronoscene.harness.files.records import ROWS_FILE, Failure, read_with_rows
-from chronoscene.harness.plan.settings import BenchSettings, RunSettings
+from chronoscene.harness.plan.settings import bench_settings
 from chronoscene.harness.plan.stop import parse_duration
 from chronoscene.harness.report.summary import ENTRY_COLUMNS, summarise
 from chronoscene.harness.run.runner import run_bench
@@ -251,7 +250,9 @@ def bench(
         >>> result = bench("data/plaza", ["chronogs", "3dgs"], out="runs", budget="90s")
         >>> result.table(["psnr"])
     """
-    run = RunSettings(
+    settings = bench_settings(
+        map(Path, [scenes] if isinstance(scenes, str | Path) else scenes),
+        _several(methods),
         Path(out),
         preset=str(preset),
         overrides={key: as_typed(value) for key, value in (overrides or {}).items()},
@@ -261,17 +262,10 @@ def bench(
         validation=validation,
         threads=threads,
         device=device,
-        period_by=period_by,
-    )
-    folders = map(Path, [scenes] if isinstance(scenes, str | Path) else scenes)
-    found = (find_scenes(folder, format=format, period_by=period_by) for folder in folders)
-    settings = BenchSettings(
-        scenes=tuple(chain.from_iterable(found)),
-        methods=_several(methods),
-        run=run,
         strategies=_several(strategies),
         seeds=tuple(seeds),
         dataset_format=format,
+        period_by=period_by,
         overwrite=overwrite,
         jobs=jobs,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from importlib import import_module
 from typing import Any
 
 from chronoscene.errors import ChronoSceneError, ConfigError, ShapeError
@@ -40,3 +41,25 @@ def nearest(value: str, known: Sequence[str], *, otherwise: str) -> str:
     """Return advice that names the known word most like a value, or else the other advice."""
     close = get_close_matches(value, known, n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
+
+
+def import_extra(package: str, extra: str, place: str) -> Any:
+    """Import a package that only one extra of ChronoScene needs.
+
+    Args:
+        package: Name of the module.
+        extra: Name of the extra that installs it.
+        place: Command or option that needs it.
+
+    Raises:
+        ConfigError: If it is not installed, or cannot be loaded.
+    """
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise ConfigError(
+            place,
+            expected=f"the package {package}",
+            found=str(error),
+            todo=f"pip install 'chronoscene[{extra}]'",
+        ) from error

@@ -16,7 +16,6 @@ from chronoscene.formats import read_scene
 from chronoscene.harness.files.ground_truth import freeze_ground_truth, ground_truth_folder
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.records import RunRecord
-from chronoscene.images.store import ImageStore
 from chronoscene.io.processes import Report
 from chronoscene.metrics.registry import Scorers, make_scorers
 from chronoscene.scene import Scene
@@ -144,8 +143,7 @@ class _Truths:
     def freeze(self, scene: Scene, run: RunRecord) -> Path:
         """Write the test photos of a scene at the width of a run, unless they are there."""
         place = self._folder / f"{run.scene_hash}-{run.max_width}"
-        store = ImageStore(scene, max_width=run.max_width, memory_limit=0)
-        freeze_ground_truth(place, scene, run.scene_hash, store, run.max_width)
+        freeze_ground_truth(place, scene, run.scene_hash, run.max_width)
         return ground_truth_folder(place, scene.name)
 
     def scorers(self, entry: MeasuredEntry) -> Scorers:

@@ -11,23 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.checks import import_extra
+from chronoscene.errors import CheckpointError
 
 MAX_TABLE = 2**23
 """Values of a sequence; ``constriction`` has frequencies of 24 bits."""
 
 
 def _constriction() -> Any:
-    try:
-        import constriction
-    except ImportError as error:
-        raise ConfigError(
-            "coded models",
-            expected="the package constriction",
-            found="none",
-            todo="install it with pip install 'chronoscene[compress]'",
-        ) from error
-    return constriction
+    return import_extra("constriction", "compress", "coded models")
 
 
 def _model(counts: NDArray[np.int64]) -> Any:

@@ -87,6 +87,11 @@ class DetectedFormat:
     """Further formats whose marks the folder has: a user must name one."""
 
     @property
+    def module(self) -> Any:
+        """Return the module of the format."""
+        return import_module(installed_formats()[self.name])
+
+    @property
     def options(self) -> dict[str, str]:
         """Arguments on periods of ``read`` and ``assign``.
 
@@ -95,7 +100,7 @@ class DetectedFormat:
         """
         if self.period_by is None:
             return {}
-        if not hasattr(load_format(self.name), "PERIOD_BY"):
+        if not hasattr(self.module, "PERIOD_BY"):
             raise ConfigError(
                 "--period-by",
                 expected=f"no such option for {self.name}, which defines its own periods",
@@ -107,7 +112,7 @@ class DetectedFormat:
     @property
     def is_by_names(self) -> bool:
         """True if the periods follow from the image names of a COLMAP model."""
-        return hasattr(load_format(self.name), "assign")
+        return hasattr(self.module, "assign")
 
     @property
     def notes(self) -> list[str]:
@@ -131,7 +136,7 @@ class DetectedFormat:
         """Read the scene; see `read_scene`."""
         self.check_single()
         model = {"model": self.model} if self.is_by_names else {}
-        scene: Scene = load_format(self.name).read(self.path, **model, **self.options)
+        scene: Scene = self.module.read(self.path, **model, **self.options)
         return scene
 
 
@@ -241,17 +246,14 @@ def _no_periods(path: Path, model: FoundModel | None) -> SceneError:
 
 def find_scenes(
     path: Path, *, format: str | None = None, period_by: str | None = None
-) -> list[Path]:
-    """Return the scene folder itself, or the scenes directly inside a folder, sorted by name.
+) -> list[DetectedFormat]:
+    """Return the scene of a folder, or those directly inside it, sorted by name.
 
     Raises:
         SceneError: If there is no scene; lists what was looked for.
     """
-    if found := _scenes_of(path, format, period_by):
-        return found
-    if format is None:
-        detect(path, period_by=period_by)
-    return [path]
+    found = _scenes_of(path, format, period_by)
+    return found or [detect(path, format=format, period_by=period_by)]
 
 
 def nearby_scenes(*, format: str | None = None, period_by: str | None = None) -> Path:
@@ -273,16 +275,19 @@ def nearby_scenes(*, format: str | None = None, period_by: str | None = None) ->
     )
 
 
-def _scenes_of(path: Path, format: str | None, period_by: str | None) -> list[Path]:
-    def is_scene(folder: Path) -> bool:
-        found = match_format(folder, period_by=period_by)
-        return found is not None and format in (None, found.name, *found.others)
+def _scenes_of(path: Path, format: str | None, period_by: str | None) -> list[DetectedFormat]:
+    def scene_in(folder: Path) -> DetectedFormat | None:
+        found = match_format(folder, period_by=period_by) if folder.is_dir() else None
+        if found is None or format is None:
+            return found
+        known = format in (found.name, *found.others)
+        return detect(folder, format=format, period_by=period_by) if known else None
 
     if not path.is_dir():
         return []
-    if is_scene(path):
-        return [path]
-    return sorted(child for child in path.iterdir() if child.is_dir() and is_scene(child))
+    if scene := scene_in(path):
+        return [scene]
+    return [scene for child in sorted(path.iterdir()) if (scene := scene_in(child))]
 
 
 def read_scene(

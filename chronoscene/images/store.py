@@ -52,6 +52,12 @@ def evaluation_size(width: int, height: int, max_width: int = MAX_WIDTH) -> tupl
     return max_width, max(1, height * max_width // width)
 
 
+def decoded_bytes(scene: Scene, frame: Frame, max_width: int) -> int:
+    """Return the memory of the image of a frame at the evaluation size, and of its mask file."""
+    width, height = evaluation_size(*frame.camera.size, max_width)
+    return width * height * (4 if frame.name in scene.masks else 3)
+
+
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     """Resize a camera with its image; each axis is scaled by its exact ratio.
 
@@ -160,18 +166,13 @@ class ImageStore:
         free = self._limit
         with self._lock:
             for frame in frames[: 1 + self._ahead]:
-                free -= self.bytes_of(frame)
+                free -= decoded_bytes(self._scene, frame, self._max_width)
                 if free < 0:
                     break
                 if frame.name in self._cache:
                     self._cache.move_to_end(frame.name)  # it must not leave before it is used
                 elif frame.name not in self._coming:
                     self._coming[frame.name] = self._decoders.submit(self._fetch, frame)
-
-    def bytes_of(self, frame: Frame) -> int:
-        """Return the memory of the image of a frame and of its mask file in the cache."""
-        width, height = evaluation_size(*frame.camera.size, self._max_width)
-        return width * height * (4 if frame.name in self._scene.masks else 3)
 
     def _photo(self, frame: Frame) -> Photo:
         with self._lock:

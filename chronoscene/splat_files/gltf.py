@@ -28,12 +28,11 @@ _FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def encode(cloud: GaussianCloud, *, comments: Sequence[str] = (), up: ArrayLike) -> bytes:
+def encode(cloud: GaussianCloud, *, up: ArrayLike) -> bytes:
     """Make a file.
 
     Args:
         cloud: In the frame of the scene.
-        comments: Lines for ``asset.extras.comments``.
         up: Direction that is up in the scene. [3]
     """
     quats = cloud.quats[:, [1, 2, 3, 0]] / np.linalg.norm(cloud.quats, axis=1, keepdims=True)
@@ -59,11 +58,7 @@ def encode(cloud: GaussianCloud, *, comments: Sequence[str] = (), up: ArrayLike)
         "extensions": {NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
     document = {
-        "asset": {
-            "version": "2.0",
-            "generator": "ChronoScene",
-            "extras": {"comments": list(comments)},
-        },
+        "asset": {"version": "2.0", "generator": "ChronoScene", "extras": {"comments": []}},
         "extensionsUsed": [NAME],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -76,11 +71,16 @@ def encode(cloud: GaussianCloud, *, comments: Sequence[str] = (), up: ArrayLike)
     return _container(json.dumps(document).encode(), b"".join(data))
 
 
+def with_comments(data: bytes, comments: Sequence[str]) -> bytes:
+    """Put lines into ``asset.extras.comments`` of a file."""
+    document, binary = _parts(data)
+    document["asset"]["extras"]["comments"] = list(comments)
+    return _container(json.dumps(document).encode(), bytes(binary))
+
+
 def decode(data: bytes) -> GaussianCloud:
     """Read what `encode` made, in the frame of the scene."""
-    (length,) = struct.unpack_from("<I", data, 12)
-    document = json.loads(data[20 : 20 + length])
-    binary = memoryview(data)[28 + length :]
+    document, binary = _parts(data)
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     count = document["accessors"][0]["count"]
 
@@ -110,6 +110,12 @@ def _turn_to_y(up: ArrayLike) -> list[float]:
         return [1.0, 0.0, 0.0, 0.0]  # half a turn about x
     quat = np.array([-z, 0.0, x, 1 + y])
     return [float(value) for value in quat / np.linalg.norm(quat)]
+
+
+def _parts(data: bytes) -> tuple[dict[str, Any], memoryview]:
+    """Take a file apart that `_container` made."""
+    (length,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + length]), memoryview(data)[28 + length :]
 
 
 def _container(document: bytes, binary: bytes) -> bytes:

@@ -29,8 +29,8 @@ _LIMIT = 1e-6
 """Opacities are kept this far from 0 and 1, which have no logit."""
 
 
-def encode(cloud: GaussianCloud, *, comments: Sequence[str] = ()) -> bytes:
-    """Make a binary file with comments in its header, a line each."""
+def encode(cloud: GaussianCloud) -> bytes:
+    """Make a binary file."""
     count = len(cloud)
     opacities = cloud.opacities.astype(np.float64).clip(_LIMIT, 1 - _LIMIT)
     columns = (
@@ -46,8 +46,14 @@ def encode(cloud: GaussianCloud, *, comments: Sequence[str] = ()) -> bytes:
     vertices = table.view([(name, "<f4") for name in NAMES])[:, 0]
     element = PlyElement.describe(vertices, "vertex")
     file = io.BytesIO()
-    PlyData([element], byte_order="<", comments=list(comments)).write(file)
+    PlyData([element], byte_order="<").write(file)
     return file.getvalue()
+
+
+def with_comments(data: bytes, comments: Sequence[str]) -> bytes:
+    """Put lines into the header of a file."""
+    form, end, rest = data.partition(b" 1.0\n")
+    return form + end + "".join(f"comment {line}\n" for line in comments).encode("ascii") + rest
 
 
 def decode(data: bytes) -> GaussianCloud:

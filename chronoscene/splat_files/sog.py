@@ -34,8 +34,8 @@ _ROUNDS = 6
 """Rounds of k-means."""
 
 
-def encode(cloud: GaussianCloud, *, comments: Sequence[str] = ()) -> bytes:
-    """Make a file; comments become ``asset.comments`` of its JSON."""
+def encode(cloud: GaussianCloud) -> bytes:
+    """Make a file."""
     log_means = np.sign(cloud.means) * np.log1p(np.abs(cloud.means.astype(np.float64)))
     low, high = log_means.min(axis=0), log_means.max(axis=0)
     levels = np.rint((log_means - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.uint16)
@@ -60,7 +60,7 @@ def encode(cloud: GaussianCloud, *, comments: Sequence[str] = ()) -> bytes:
     files = list(images)
     meta = {
         "version": 2,
-        "asset": {"generator": "ChronoScene", "comments": list(comments)},
+        "asset": {"generator": "ChronoScene", "comments": []},
         "count": len(cloud),
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": files[:2]},
         "scales": {"codebook": scale_table, "files": files[2:3]},
@@ -68,7 +68,17 @@ def encode(cloud: GaussianCloud, *, comments: Sequence[str] = ()) -> bytes:
         "sh0": {"codebook": colour_table, "files": files[4:5]},
         "shN": {"count": len(palette), "bands": 3, "codebook": entry_table, "files": files[5:]},
     }
-    return _archive(meta, images)
+    coded = {name: _webp(pixels) for name, pixels in images.items()}
+    return _archive({"meta.json": json.dumps(meta).encode()} | coded)
+
+
+def with_comments(data: bytes, comments: Sequence[str]) -> bytes:
+    """Put lines into ``asset.comments`` of the JSON of a file."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files["meta.json"])
+    meta["asset"]["comments"] = list(comments)
+    return _archive(files | {"meta.json": json.dumps(meta).encode()})
 
 
 def decode(data: bytes) -> GaussianCloud:
@@ -101,17 +111,20 @@ def decode(data: bytes) -> GaussianCloud:
     )
 
 
-def _archive(meta: dict[str, Any], images: dict[str, NDArray[np.uint8]]) -> bytes:
+def _archive(files: dict[str, bytes]) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
-        # An entry without a time stamp: equal clouds give equal files.
-        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
-        for name, pixels in images.items():
-            image = io.BytesIO()
-            # Exact: the colours of transparent pixels are kept, too.
-            Image.fromarray(pixels).save(image, "WEBP", lossless=True, exact=True, method=6)
-            archive.writestr(zipfile.ZipInfo(name), image.getvalue())
+        for name, content in files.items():
+            # An entry without a time stamp: equal clouds give equal files.
+            archive.writestr(zipfile.ZipInfo(name), content)
     return file.getvalue()
+
+
+def _webp(pixels: NDArray[np.uint8]) -> bytes:
+    image = io.BytesIO()
+    # Exact: the colours of transparent pixels are kept, too.
+    Image.fromarray(pixels).save(image, "WEBP", lossless=True, exact=True, method=6)
+    return image.getvalue()
 
 
 def _square(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Mask
-from chronoscene.errors import BackendError, ConfigError
+from chronoscene.checks import import_extra
+from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.io.documents import read_json_document
@@ -32,7 +32,7 @@ from chronoscene.survey.laz import write_points
 from chronoscene.survey.map_frame import MapFrame, map_frame
 from chronoscene.survey.rasters import read_polygons, write_raster
 from chronoscene.survey.surface import Surface, map_surface
-from chronoscene.survey.uncertainty import find_registration, stable_ground
+from chronoscene.survey.uncertainty import UNKNOWN, certified_registration
 from chronoscene.survey.views import depth_views
 
 WHOLE = "whole area"
@@ -164,16 +164,10 @@ def check_packages() -> None:
     """Check that the packages of the extra are installed.
 
     Raises:
-        BackendError: If one is missing.
+        ConfigError: If one is missing.
     """
     for name in ("laspy", "lazrs", "py4dgeo", "rasterio"):
-        if find_spec(name) is None:
-            raise BackendError(
-                "chronoscene survey",
-                expected=f"the package {name}",
-                found="none",
-                todo="pip install 'chronoscene[survey]'",
-            )
+        import_extra(name, "survey", "chronoscene survey")
 
 
 def write_survey(
@@ -269,7 +263,7 @@ def survey_scene(scene: Scene, folder: Path, options: SurveyOptions) -> dict[str
     periods, pairs = [work.write_cloud(*item) for item in clouds.items()], []
     for pair in options.pairs:
         alone = {p: sparse_cloud(scene, p, work.frame, alone=True) for p in pair}
-        registration = find_registration(scene, pair, stable_ground(np.zeros(0), np.zeros(0), 1), 1)
+        registration = certified_registration(scene, pair) or UNKNOWN
         spacing = _spacing(alone[pair[0]].xyz)
         made = work.compare_clouds(pair, alone, spacing, registration.sigma)
         pairs.append({"periods": list(pair), "registration": asdict(registration)} | made)

@@ -7,7 +7,6 @@ normal); Rolstad, Haug and Denby 2009 (means over an area, with a spherical vari
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -106,6 +105,9 @@ def variance_of_mean(area: float, length: float, cells: int) -> float:
     return float(max(share, 1 / cells))
 
 
+UNKNOWN = Registration(0.0, f"unknown, and left out: there is no {CERTIFICATE} of this pair")
+
+
 def find_registration(
     scene: Scene, periods: tuple[int, int], stable: StableGround, area: float
 ) -> Registration:
@@ -124,19 +126,22 @@ def find_registration(
     Raises:
         SceneError: If the certificate is damaged.
     """
-    labels = [scene.periods[period].label for period in periods]
-    limit = _certified(scene.root / CERTIFICATE, labels)
-    if limit is not None:
-        return Registration(limit / CONFIDENCE, f"{CERTIFICATE}, displacement of the pair")
+    if certified := certified_registration(scene, periods):
+        return certified
     if not stable.cells:
-        return Registration(0.0, f"unknown, and left out: there is no {CERTIFICATE} of this pair")
+        return UNKNOWN
     mean = stable.nmad**2 * variance_of_mean(area, stable.length, stable.cells)
     source = f"stable ground, as the scene has no {CERTIFICATE} of this pair"
     return Registration(float(np.sqrt(stable.median**2 + mean)), source)
 
 
-def _certified(path: Path, labels: list[str]) -> float | None:
-    """Upper end of the interval of the displacement of a pair in metres, None without one."""
+def certified_registration(scene: Scene, periods: tuple[int, int]) -> Registration | None:
+    """Return what the certificate of a scene says of a pair of periods; None if nothing.
+
+    Raises:
+        SceneError: If the certificate is damaged.
+    """
+    path, labels = scene.root / CERTIFICATE, [scene.periods[period].label for period in periods]
     if not path.is_file():
         return None
     data = read_json_document(path)
@@ -157,4 +162,6 @@ def _certified(path: Path, labels: list[str]) -> float | None:
             found=f"other JSON ({type(error).__name__}: {error})",
             todo="copy the certificate again, or remove it",
         ) from error
-    return limits[-1] if limits else None
+    if not limits:
+        return None
+    return Registration(limits[-1] / CONFIDENCE, f"{CERTIFICATE}, displacement of the pair")

@@ -16,7 +16,7 @@ from chronoscene import formats
 from chronoscene.colmap.raw_model import model_files
 from chronoscene.convert import remarks_on
 from chronoscene.errors import ChronoSceneError, SceneError
-from chronoscene.formats import DetectedFormat, load_format
+from chronoscene.formats import DetectedFormat
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.colmap_layout import Assigned
 from chronoscene.images.masks import mask_place
@@ -124,7 +124,7 @@ def _read_project(scene: RawScene, detected: DetectedFormat) -> Origin:
     """Assign periods to the images of a COLMAP project as its format defines them."""
     try:
         detected.check_single()
-        module, images = load_format(detected.name), scene.root / "images"
+        module, images = detected.module, scene.root / "images"
         assigned: Assigned = module.assign(images, scene.names, **detected.options)
     except SceneError as error:
         return Origin(detected, is_project=True, error=error)

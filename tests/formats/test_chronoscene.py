@@ -300,8 +300,8 @@ def test_a_point_without_observations_survives(make_scene_folder, tmp_path):
 def test_find_scenes(make_scene_folder, tmp_path):
     b, a = make_scene_folder(name="set/b"), make_scene_folder(name="set/a")
     (tmp_path / "set" / "notes").mkdir()
-    assert find_scenes(tmp_path / "set") == [a, b]
-    assert find_scenes(a) == [a]
+    assert [scene.path for scene in find_scenes(tmp_path / "set")] == [a, b]
+    assert [scene.path for scene in find_scenes(a)] == [a]
     with pytest.raises(SceneError, match=r"known format \(chronoscene: sparse/split.txt"):
         find_scenes(tmp_path / "set" / "notes")
 

@@ -235,7 +235,7 @@ def test_models_are_found_where_programs_leave_them(colmap_folder, place, images
     assert scene.image_path(scene.frames[0]).is_file()
     said = f"the model is read from {place}, the images from {images}"
     assert detect(folder, format=scene.format).notes == [said]
-    assert find_scenes(folder.parent) == [folder]
+    assert [scene.path for scene in find_scenes(folder.parent)] == [folder]
 
 
 def test_the_usual_place_wins(colmap_folder):
@@ -304,7 +304,8 @@ def test_periods_from_the_dates_of_photos(colmap_folder, by, periods, labels):
     scene = read_scene(folder, period_by=by)
     assert [f.period for f in scene.frames] == periods
     assert [p.label for p in scene.periods] == labels
-    assert find_scenes(folder.parent, period_by=by) == [folder]
+    (scene,) = find_scenes(folder.parent, period_by=by)
+    assert scene.path == folder
 
 
 def test_dates_in_file_names_count_too(colmap_folder):

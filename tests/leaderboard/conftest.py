@@ -14,7 +14,6 @@ from chronoscene.harness.files.predictions import ImageWriter, load_image
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.records import PREDICTIONS, write_run
 from chronoscene.harness.score.scoring import rescore
-from chronoscene.images.store import ImageStore
 from chronoscene.metrics.registry import make_scorers
 from chronoscene.scene.splits import split_hash
 from leaderboard.submit import submit
@@ -71,8 +70,7 @@ def write_noisy(runs: Path, scene, method: str, seed: int, *, noise: int) -> Non
         method, seed, scene=scene.name, config_hash="c" * 64, max_width=1600, commit="1" * 40,
         period_labels={str(p.id): p.label for p in scene.periods}, iterations=1000, **hashes,
     )  # fmt: skip
-    store = ImageStore(scene)
-    truth = freeze_ground_truth(runs, scene, run.scene_hash, store, run.max_width)
+    truth = freeze_ground_truth(runs, scene, run.scene_hash, run.max_width)
     folder = runs / scene.name / f"{method}-joint-fast" / f"seed{seed}"
     writer, rng = ImageWriter(folder / PREDICTIONS), np.random.default_rng((seed, noise))
     for photo in truth.images:

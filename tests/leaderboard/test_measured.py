@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import leaderboard
+from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.resolve import resolve_method
 from chronoscene.harness.plan.settings import RunSettings
@@ -32,8 +33,9 @@ def test_an_entry_has_the_configuration_of_today_or_says_that_it_is_outdated(pat
         pytest.skip("no preset alone made it")
     settings = RunSettings(Path(), preset=record.preset, max_width=record.max_width)
     job = Job(
-        scene_root="", scene_format="", scene="", scene_hash="", split_hash="",
-        method=record.method, method_name=record.method, strategy=record.strategy, seed=0,
+        origin=RunOrigin(method=record.method, scene_root="", scene_format=""),
+        scene="", scene_hash="", split_hash="",
+        method_name=record.method, strategy=record.strategy, seed=0,
         settings=settings,
     )  # fmt: skip
     run = resolve_method(record.method, load_spec(record.method), settings).run(job)

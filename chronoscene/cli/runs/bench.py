@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from chronoscene.cli.options import (
 )
 from chronoscene.cli.output import check_place, say
 from chronoscene.cli.report.results import print_runs
-from chronoscene.formats import find_scenes, nearby_scenes
+from chronoscene.formats import nearby_scenes
 from chronoscene.harness.files.records import read_failures
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.settings import (
@@ -115,7 +114,9 @@ WIDTH = click.option(
 @click.option(
     "--overwrite", is_flag=True, help="Replace finished runs that were made with other settings."
 )
-def command(methods: str, strategies: str, seeds: int, seed: int, **options: Any) -> None:
+def command(
+    methods: str, strategies: str, seeds: int, seed: int, out: Path, **options: Any
+) -> None:
     """Train, render and score methods on scenes.
 
     DIR is a scene or a folder of scenes; without one, the current folder is searched, then data/.
@@ -129,10 +130,10 @@ def command(methods: str, strategies: str, seeds: int, seed: int, **options: Any
         methods=names,
         strategies=split_list("--strategy", strategies),
         seeds=tuple(range(seed, seed + seeds)),
+        out=out,
         **options,
     )
-    outcome = run_bench(settings, say)
-    report(outcome, settings.run.runs)
+    report(run_bench(settings, say), out)
 
 
 def settings_from(
@@ -154,9 +155,8 @@ def settings_from(
         SceneError: If a folder has no scene.
     """
     reading = {"format": options["dataset_format"], "period_by": options["period_by"]}
-    folders = scenes or (nearby_scenes(**reading),)
     settings = bench_settings(
-        folders,
+        scenes or (nearby_scenes(**reading),),
         methods,
         out,
         overrides=parse_assignments(assignments),
@@ -166,10 +166,9 @@ def settings_from(
         photo_disk=round(photo_disk * 1e9),
         **options,
     )
-    scenes = tuple(scene for folder in folders for scene in find_scenes(folder, **reading))
-    check_outside(out, scenes, option="--out")
+    check_outside(out, [scene.path for scene in settings.scenes], option="--out")
     check_place("--out", out)
-    return replace(settings, scenes=scenes)
+    return settings
 
 
 def report(outcome: BenchOutcome, out: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -18,7 +18,7 @@ from chronoscene.figures.cloud import cloud_of
 from chronoscene.formats.shared.ply import write_vertices
 from chronoscene.harness.use.change_scores import changes_csv, changes_table, map_run
 from chronoscene.harness.use.changes import ALL_PAIRS, ChangeMap, usual_pairs
-from chronoscene.harness.use.trained_run import TrainedRun, open_run
+from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import boxed_text
 
@@ -60,7 +60,8 @@ def command(
     scores.
     """
     run = open_run(folder, device=device, plugin=plugin)
-    pairs = [_pair(run, *names) for names in between]
+    labels = [run.record.period_labels[str(period)] for period in range(run.num_periods)]
+    pairs = [parse_pair(labels, names) for names in between]
     pairs = pairs or usual_pairs(run.num_periods)
     if not pairs:
         raise ConfigError(
@@ -90,17 +91,26 @@ def command(
         say(f"not scored: no change masks of test views in {found.root / 'gt'}")
 
 
-def _pair(run: TrainedRun, *names: str) -> tuple[int, int]:
-    """Two whole periods in their order."""
-    first, second = sorted(run.parse_period(name) for name in names)
-    if first == second or not (first.is_integer() and second.is_integer()):
+def parse_pair(labels: Sequence[str], names: Sequence[str]) -> tuple[int, int]:
+    """Parse two periods, by numbers or labels; the earlier comes first.
+
+    Args:
+        labels: Of all periods.
+        names: Values of the option ``--between``.
+
+    Raises:
+        ConfigError: If one is unknown, or they are equal.
+    """
+    known = {str(i): i for i in range(len(labels))} | {label: i for i, label in enumerate(labels)}
+    first, second = sorted(known.get(name, -1) for name in names)
+    if first < 0 or first == second:
         raise ConfigError(
             f"--between {' '.join(names)}",
             expected="two periods of the scene",
-            found="the same one twice" if first == second else "a time between them",
-            todo="choose two of them",
+            found="an unknown one" if first < 0 else "the same one twice",
+            todo=f"choose among {', '.join(f'{i} ({name})' for i, name in enumerate(labels))}",
         )
-    return int(first), int(second)
+    return first, second
 
 
 def _write_cloud(path: Path, made: ChangeMap) -> None:

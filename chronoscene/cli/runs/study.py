@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import click
@@ -31,7 +32,7 @@ ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 @WIDTH
 @LPIPS_WEIGHTS
 @RUNS_OUT
-def command(name: str, seeds: int, **options: Any) -> None:
+def command(name: str, seeds: int, out: Path, **options: Any) -> None:
     """Run variants of a method on scenes, for one table.
 
     NAME is a study that comes with a method, such as components of ChronoGS, or FILE.toml one of
@@ -42,13 +43,13 @@ def command(name: str, seeds: int, **options: Any) -> None:
     file = find_study(name)
     study = read_study(file)
     look_here_for([study.method, *(row.method for row in study.rows)])
-    settings = settings_from(methods=(), seeds=tuple(range(seeds)), **options)
+    settings = settings_from(methods=(), seeds=tuple(range(seeds)), out=out, **options)
     outcome, finished = run_study(study, settings, say)
     if outcome.finished:
         texts = study_texts(study, finished, outcome.failures, width=terminal_width(None))
         emit(texts["table"], None)
         for style, ending in ENDINGS.items():
-            emit(texts[style], settings.run.runs / f"study-{file.stem}.{ending}")
+            emit(texts[style], out / f"study-{file.stem}.{ending}")
     else:
         for failure in outcome.failures:
             say(f"failed: {failure.scene}, {failure.method}: {failure.reason}")

@@ -11,15 +11,13 @@ import click
 from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE
 from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
 from chronoscene.cli.progress import announce, progress_bar
-from chronoscene.cli.runs.changes import BETWEEN
+from chronoscene.cli.runs.changes import BETWEEN, parse_pair
 from chronoscene.cli.scenes.reading import read_and_note
-from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RUN_FILE
 from chronoscene.harness.use.changes import usual_pairs
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import Table, boxed_text
-from chronoscene.scene import Scene
 from chronoscene.survey.products import SurveyOptions, check_packages, write_survey
 
 
@@ -67,26 +65,13 @@ def command(
     announce("read the scene")
     found = read_and_note(source, None, None) if run is None else run.scene(scene)
     check_outside(out, [found.root], option="--out")
-    pairs = tuple(_pair(found, *names) for names in between) or usual_pairs(found.num_periods)
+    labels = [period.label for period in found.periods]
+    pairs = [parse_pair(labels, names) for names in between] or usual_pairs(found.num_periods)
     options = SurveyOptions(tuple(pairs), resolution, area, crs)
     with staged_folder(out) as staged, progress_bar() as report:
         summary = write_survey(run, found, staged, options, report)
     _print(summary)
     report_written(out)
-
-
-def _pair(scene: Scene, *names: str) -> tuple[int, int]:
-    """Two periods in their order, by numbers or labels."""
-    known = {str(p.id): p.id for p in scene.periods} | {p.label: p.id for p in scene.periods}
-    first, second = sorted(known.get(name, -1) for name in names)
-    if first < 0 or first == second:
-        raise ConfigError(
-            f"--between {' '.join(names)}",
-            expected="two periods of the scene",
-            found="an unknown one" if first < 0 else "the same one twice",
-            todo=f"choose among {', '.join(f'{p.id} ({p.label})' for p in scene.periods)}",
-        )
-    return first, second
 
 
 def _print(summary: Mapping[str, Any]) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import ImageWriter, Manifest, read_manifest, safe_part
 from chronoscene.harness.files.records import GROUND_TRUTH
-from chronoscene.images.store import ImageStore
+from chronoscene.images.decoding import load_photo
+from chronoscene.images.store import evaluation_size
 from chronoscene.io.staging import needing_space, partial_name
 from chronoscene.scene import Scene
 
@@ -24,18 +25,15 @@ def truth_of(run: Path) -> Path:
     return run.parents[2] / GROUND_TRUTH / run.parents[1].name
 
 
-def freeze_ground_truth(
-    runs: Path, scene: Scene, scene_hash: str, store: ImageStore, max_width: int
-) -> Manifest:
+def freeze_ground_truth(runs: Path, scene: Scene, scene_hash: str, max_width: int) -> Manifest:
     """Write the test photos once; later calls only check that scene and size are the same.
 
     Raises:
         ConfigError: If the folder of runs holds another scene of this name, or another size.
     """
     folder = ground_truth_folder(runs, scene.name)
-    details = {"max_width": max_width}
     if not folder.exists():
-        _write_ground_truth(folder, scene, scene_hash, store, details)
+        _write_ground_truth(folder, scene, scene_hash, max_width)
     manifest = read_manifest(folder)
     if manifest.scene_hash != scene_hash:
         found = "another scene of this name, another split of it, or other photos"
@@ -46,23 +44,24 @@ def freeze_ground_truth(
     return manifest
 
 
-def _write_ground_truth(
-    folder: Path, scene: Scene, scene_hash: str, store: ImageStore, details: dict[str, int]
-) -> None:
+def _write_ground_truth(folder: Path, scene: Scene, scene_hash: str, max_width: int) -> None:
     partial = folder.with_name(partial_name(folder.name))
     try:
         with needing_space(folder):
             writer = ImageWriter(partial)
             for frame in scene.select(split="test"):
+                size = evaluation_size(*frame.camera.size, max_width)
+                file, mask_file = scene.image_path(frame), scene.masks.get(frame.name)
+                image, mask = load_photo(file, mask_file, size=size)
+                period = frame.period
                 writer.add(
-                    frame.name,
-                    store.load(frame),
-                    camera_period=frame.period,
-                    rendered_period=frame.period,
-                    mask=store.load_mask(frame),
+                    frame.name, image, camera_period=period, rendered_period=period, mask=mask
                 )
             writer.close(
-                kind="ground truth", scene=scene.name, scene_hash=scene_hash, details=details
+                kind="ground truth",
+                scene=scene.name,
+                scene_hash=scene_hash,
+                details={"max_width": max_width},
             )
         if not folder.exists():  # another bench may have written it meanwhile
             os.replace(partial, folder)

@@ -11,11 +11,11 @@ import re
 import struct
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files.records import RunRecord, damaged, read_document
@@ -25,6 +25,22 @@ MANIFEST = "manifest.json"
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _UNSAFE = re.compile(r'[%<>:"|?*\\\x00-\x1f\x7f]')
+
+
+def _inside(path: str) -> str:
+    pure = PurePosixPath(path)
+    if not pure.parts or pure.is_absolute() or ".." in pure.parts or "\\" in path or "\0" in path:
+        raise CheckpointError(
+            repr(path),
+            expected="a path below its folder",
+            found="a path that leads outside",
+            todo="do not use these files",
+        )
+    return path
+
+
+Place = Annotated[str, AfterValidator(_inside)]
+"""Path of a file below the folder of its manifest."""
 
 
 class ImageEntry(BaseModel):
@@ -38,16 +54,15 @@ class ImageEntry(BaseModel):
     """Period in which the photo was taken."""
     rendered_period: int
     """Period that the image shows."""
-    file: str
-    """Path below the folder."""
+    file: Place
     sha256: str
     width: int
     height: int
-    mask_file: str | None = None
-    """Path below the folder of the mask, 0 where the photo does not count; None if all counts."""
+    mask_file: Place | None = None
+    """The mask, 0 where the photo does not count; None if all counts."""
     mask_sha256: str | None = None
-    changed_file: str | None = None
-    """Path below the folder of the mask of changes between periods, not 0 where the view differs
+    changed_file: Place | None = None
+    """The mask of changes between periods, not 0 where the view differs
     from others; None if unknown."""
     changed_sha256: str | None = None
 
@@ -64,6 +79,13 @@ class Manifest(BaseModel):
     details: Mapping[str, Any]
     """Evaluation size and the like."""
     images: tuple[ImageEntry, ...]
+
+    @model_validator(mode="after")
+    def _of_distinct_views(self) -> Self:
+        views = {(e.view, e.rendered_period) for e in self.images}
+        if len(views) != len(self.images):
+            raise ValueError("a view twice")
+        return self
 
 
 def safe_name(name: str) -> str:
@@ -83,18 +105,6 @@ def image_file(view: str) -> str:
         CheckpointError: If the name would lead out of the folder.
     """
     return f"{_inside(safe_name(view))}.png"
-
-
-def _inside(path: str) -> PurePosixPath:
-    pure = PurePosixPath(path)
-    if not pure.parts or pure.is_absolute() or ".." in pure.parts or "\\" in path or "\0" in path:
-        raise CheckpointError(
-            repr(path),
-            expected="a path below its folder",
-            found="a path that leads outside",
-            todo="do not use these files",
-        )
-    return pure
 
 
 def to_bytes(rgb: ArrayLike) -> NDArray[np.uint8]:
@@ -209,16 +219,7 @@ def read_manifest(folder: Path) -> Manifest:
     Raises:
         CheckpointError: If it is missing, damaged, or names a path outside the folder.
     """
-    path = folder / MANIFEST
-    manifest = read_document(path, Manifest, expected="a manifest of images")
-    views = [(e.view, e.rendered_period) for e in manifest.images]
-    if len(set(views)) != len(views):
-        raise damaged(path, "a view twice")
-    for entry in manifest.images:
-        for file in (entry.file, entry.mask_file, entry.changed_file):
-            if file is not None:
-                _inside(file)
-    return manifest
+    return read_document(folder / MANIFEST, Manifest, expected="a manifest of images")
 
 
 def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
@@ -256,7 +257,7 @@ def _load_png(
     """Decode one listed file; channels are in OpenCV's order."""
     import cv2
 
-    path = folder / _inside(file)
+    path = folder / file
     if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
         raise CheckpointError(
             path, expected="an image", found="no such file", todo="run bench again"

@@ -30,10 +30,8 @@ def scene_hash(scene: Scene) -> str:
     for frame in scene.frames:
         camera = frame.camera
         line = [frame.name, frame.period, frame.split, camera.model, camera.width, camera.height]
-        files = [_file_hash(scene.image_path(frame))]
-        if frame.name in scene.masks:
-            files.append(_file_hash(scene.masks[frame.name]))
-        digest.update(json.dumps([*line, *camera.params, *files]).encode())
+        files = filter(None, (scene.image_path(frame), scene.masks.get(frame.name)))
+        digest.update(json.dumps([*line, *camera.params, *map(_file_hash, files)]).encode())
         digest.update((np.round(frame.cam_from_world, 9) + 0.0).tobytes())
     points = scene.points
     for array in (points.xyz, points.rgb, points.track_start, points.track_frame):

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from chronoscene.errors import CheckpointError
-from chronoscene.io.documents import plain_file, read_json_document
+from chronoscene.io.documents import plain_file
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.methods import PeriodSharing
@@ -178,6 +178,20 @@ class RunRecord(BaseModel):
         return f"{self.scene}: {' '.join(filter(None, names))} seed {self.seed}"
 
 
+class _Decides(BaseModel):
+    model_config = ConfigDict(extra="allow")
+
+    method_config: dict[str, Any]
+
+
+class _Config(BaseModel):
+    """Content of ``config.json``: `ResolvedRun.document`, of which readers need this."""
+
+    model_config = ConfigDict(extra="allow")
+
+    config: _Decides
+
+
 class Failure(BaseModel):
     """Reason for which a run ended without a result."""
 
@@ -218,20 +232,13 @@ def read_run(folder: Path) -> RunRecord:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Read ``config.json``, as `Job.document` gave it.
+    """Read ``config.json``, as `ResolvedRun.document` was.
 
     Raises:
         CheckpointError: If it is missing or damaged.
     """
-    path = folder / CONFIG_FILE
-    expected, todo = "the config of the run", "delete the run"
-    if not path.is_file():
-        raise CheckpointError(path, expected=expected, found="no such file", todo=todo)
-    document: dict[str, Any] = read_json_document(path, error=CheckpointError, todo=todo)
-    config = document.get("config")
-    if not isinstance(config, dict) or not isinstance(config.get("method_config"), dict):
-        raise CheckpointError(path, expected=expected, found="none in it", todo=todo)
-    return document
+    path, todo = folder / CONFIG_FILE, "delete the run"
+    return read_document(path, _Config, expected="the config of the run", todo=todo).model_dump()
 
 
 def read_rows(folder: Path) -> list[ViewScore]:

@@ -1,4 +1,4 @@
-"""Record of the scene and method that a run comes from (``source.json``)."""
+"""Scene and method that a run comes from (``source.json``)."""
 
 from __future__ import annotations
 
@@ -6,28 +6,53 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from chronoscene.formats import read_scene
+from chronoscene.formats import DetectedFormat, detect
 from chronoscene.harness.files.records import SOURCE_FILE, read_document
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.scene import Scene
+from chronoscene.scene.similarity import Sim3
 
 
-class RunSource(BaseModel):
-    """Method and scene of a run, which are needed to use its files again."""
+class RunOrigin(BaseModel):
+    """Method and scene of a run as it is planned."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     method: str
     """Argument of `load_spec`: a name or ``module:SPEC``."""
-    plugin_path: str | None
-    """Folder from which ``module:SPEC`` was imported."""
+    plugin_path: str | None = None
+    """Folder from which ``module:SPEC`` is imported."""
     scene_root: str
     scene_format: str
+    """Name in `chronoscene.formats`."""
     period_by: str | None = None
-    """Argument of `read_scene`."""
+    """Rule by which the images are grouped into periods, as for `read_scene`."""
     validation: bool = False
     """Argument of `read_bench_scene`."""
+
+    def read_scene(self, root: Path | None = None) -> Scene:
+        """Read the scene, from ``root`` if it has moved.
+
+        Raises:
+            SceneError: If it cannot be read.
+        """
+        place = root or Path(self.scene_root)
+        found = detect(place, format=self.scene_format, period_by=self.period_by)
+        return read_bench_scene(found, validation=self.validation)
+
+
+class RunSource(RunOrigin):
+    """Method and scene of a run, which are needed to use its files again."""
+
     training_from_world: list[list[float]]
     """Similarity transform as a matrix. [4, 4]"""
+
+
+def write_source(folder: Path, origin: RunOrigin, training_from_world: Sim3) -> None:
+    """Write ``source.json`` of a run into its folder."""
+    matrix = training_from_world.to_matrix().tolist()
+    source = RunSource(**origin.model_dump(), training_from_world=matrix)
+    write_text_atomic(folder / SOURCE_FILE, source.model_dump_json(indent=1) + "\n")
 
 
 def read_source(folder: Path) -> RunSource:
@@ -45,19 +70,17 @@ def read_source(folder: Path) -> RunSource:
     )
 
 
-def read_bench_scene(
-    root: Path, *, format: str | None, period_by: str | None, validation: bool
-) -> Scene:
+def read_bench_scene(found: DetectedFormat, *, validation: bool) -> Scene:
     """Read a scene as runs have it: bench, its workers, and whoever opens a run later.
 
     Args:
-        root: As ``format`` and ``period_by``, for `read_scene`.
+        found: Folder of the scene, with its format.
         validation: True for the training views alone, some of which are test views.
 
     Raises:
         SceneError: If the scene cannot be read, or has too few views for validation.
     """
-    scene = read_scene(root, format=format, period_by=period_by)
+    scene = found.read()
     if validation:
         from chronoscene.scene.split_making import hold_out_validation  # scipy takes time to load
 

@@ -12,11 +12,9 @@ from pydantic import TypeAdapter
 
 from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.provenance import config_hash
-from chronoscene.harness.files.records import SOURCE_FILE, Failure
-from chronoscene.harness.files.source import RunSource
+from chronoscene.harness.files.records import Failure
+from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.settings import RunSettings
-from chronoscene.io.staging import write_text_atomic
-from chronoscene.scene.similarity import Sim3
 
 LOCKS = ".locks"  # Folder beside the results, with a file for each run
 
@@ -27,14 +25,10 @@ LONGEST_NAME = 180  # Characters; file systems allow 255 bytes, and special ones
 class Job:
     """One run. Paths are absolute."""
 
-    scene_root: str
-    scene_format: str
-    """Name in `chronoscene.formats`."""
+    origin: RunOrigin
     scene: str
     scene_hash: str
     split_hash: str
-    method: str
-    """Argument of `load_spec`: a name or ``module:SPEC``."""
     method_name: str
     strategy: str
     seed: int
@@ -49,8 +43,6 @@ class Job:
     """Folder of the last of them."""
     variant: str = ""
     """Differences from the preset, in words."""
-    plugin_path: str | None = None
-    """Folder from which ``module:SPEC`` may be imported."""
     memory: int = 0
     """Bytes of memory that the run is expected to take."""
     commit: str = ""
@@ -107,20 +99,6 @@ class Job:
             seed=self.seed,
             reason=shorten(reason, 500, placeholder=" ..."),
         )
-
-    def write_source(self, training_from_world: Sim3) -> None:
-        """Write ``source.json`` of the run into its staging folder."""
-        source = RunSource(
-            method=self.method,
-            plugin_path=self.plugin_path,
-            scene_root=self.scene_root,
-            scene_format=self.scene_format,
-            period_by=self.settings.period_by,
-            validation=self.settings.validation,
-            training_from_world=training_from_world.to_matrix().tolist(),
-        )
-        path = Path(self.staging) / SOURCE_FILE
-        write_text_atomic(path, source.model_dump_json(indent=1) + "\n")
 
 
 @cache

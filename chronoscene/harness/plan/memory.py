@@ -13,14 +13,12 @@ from pathlib import Path
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import PHOTOS
-from chronoscene.harness.files.source import read_bench_scene
-from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.settings import RunSettings
 from chronoscene.images.disk_cache import DiskCache, files_of
-from chronoscene.images.store import ImageStore
+from chronoscene.images.store import ImageStore, decoded_bytes, evaluation_size
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads, machine_memory
-from chronoscene.scene import Frame, Scene
+from chronoscene.scene import Scene
 
 _DECODING = 20
 """Bytes per pixel of a file while it is decoded: 10 for plain colours, 15 with a mask file, 20 for
@@ -41,7 +39,10 @@ _MODEL = 10**9
 class PhotoNeeds:
     """Memory and disk space of the photos of a scene, in bytes; of training photos, if not said."""
 
+    scene: str
     count: int
+    size: tuple[int, int]
+    """Width and height of the largest file, in pixels."""
     total: int
     """All photos at the evaluation size."""
     largest: int
@@ -70,34 +71,37 @@ class PhotoNeeds:
         return self.in_memory + self.training + _MODEL
 
 
-def photo_needs(scene: Scene, sizes: ImageStore, settings: RunSettings) -> PhotoNeeds:
-    """Return what the photos of a run take, in the sizes of a store of them."""
-    frames = scene.select(split="train")
-    photos = [sizes.bytes_of(frame) for frame in frames]
+def photo_needs(scene: Scene, settings: RunSettings) -> PhotoNeeds:
+    """Return what the photos of a run take."""
+    width, frames = settings.max_width, scene.select(split="train")
+    photos = [decoded_bytes(scene, frame, width) for frame in frames]
     total, largest = sum(photos), max(photos)
+    size = max((frame.camera.size for frame in frames), key=math.prod)
+    pixels = max(math.prod(evaluation_size(*frame.camera.size, width)) for frame in frames)
     # With two copies of the result: as it is decoded, and as it goes into memory.
-    decoding = _DECODING * max(_pixels(frame) for frame in frames) + 2 * largest
+    decoding = _DECODING * math.prod(size) + 2 * largest
     # Files that are being decoded take half of the memory, or there is one at a time.
     threads = settings.threads or available_threads()
     decoders = max(1, min(max(2, threads // 2), settings.photo_memory // (2 * decoding)))
     fits = total + decoders * decoding <= settings.photo_memory
     return PhotoNeeds(
+        scene=scene.name,
         count=len(photos),
+        size=size,
         total=total,
         largest=largest,
         decoding=decoding,
         decoders=decoders,
         allowed=settings.photo_memory,
         on_disk=0 if fits else min(total, settings.photo_disk),
-        training=_LIBRARIES + _STEP * max(math.prod(sizes.camera(f).size) for f in frames),
-        tests=sum(sizes.bytes_of(frame) for frame in scene.select(split="test")),
+        training=_LIBRARIES + _STEP * pixels,
+        tests=sum(decoded_bytes(scene, frame, width) for frame in scene.select(split="test")),
     )
 
 
 def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
     """Open the photos of a run, within its limits."""
-    sizes = ImageStore(scene, max_width=settings.max_width)
-    needs = photo_needs(scene, sizes, settings)
+    needs = photo_needs(scene, settings)
     disk = DiskCache(settings.runs / PHOTOS, settings.photo_disk) if needs.on_disk else None
     return ImageStore(
         scene,
@@ -108,23 +112,10 @@ def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
     )
 
 
-def read_scene_of(job: Job) -> Scene:
-    """Read the scene of a job."""
-    return read_bench_scene(
-        Path(job.scene_root),
-        format=job.scene_format,
-        period_by=job.settings.period_by,
-        validation=job.settings.validation,
-    )
-
-
-def check_room(
-    scene: Scene, needs: PhotoNeeds, folder: Path, runs: int, *, here: bool = True
-) -> str:
+def check_room(needs: PhotoNeeds, folder: Path, runs: int, *, here: bool = True) -> str:
     """Check that memory and disk have room for the photos of a scene.
 
     Args:
-        scene: What is trained on.
         needs: Of its runs.
         folder: Of all runs.
         runs: How many runs are to be done.
@@ -136,22 +127,22 @@ def check_room(
     Raises:
         ConfigError: If they have not; the message says which setting would do.
     """
-    _check_memory(scene, needs, machine_memory()[1] if here else None)
+    _check_memory(needs, machine_memory()[1] if here else None)
     _check_disk(folder, needs, (1 + runs) * needs.tests)
     photos = f"{counted(needs.count, 'training photo')}, {_gb(needs.total)} when decoded"
     kept = f", {_gb(needs.on_disk)} on disk" if needs.on_disk else ""
     return (
-        f"{scene.name}: {photos}: {_gb(needs.in_memory)} in memory{kept}; a training takes "
+        f"{needs.scene}: {photos}: {_gb(needs.in_memory)} in memory{kept}; a training takes "
         f"{_gb(needs.training)} and its model besides"
     )
 
 
-def _check_memory(scene: Scene, needs: PhotoNeeds, free: int | None) -> None:
+def _check_memory(needs: PhotoNeeds, free: int | None) -> None:
     least = needs.decoding + _AT_HAND * needs.largest
     if needs.allowed < least:
-        width, height = max((f.camera.size for f in scene.select(split="train")), key=math.prod)
+        width, height = needs.size
         raise ConfigError(
-            f"{scene.name}: --photo-memory",
+            f"{needs.scene}: --photo-memory",
             expected=f"at least {_gb(least)} to decode photos of {width} x {height} pixels",
             found=_gb(needs.allowed),
             todo=f"use --photo-memory {math.ceil(least / 1e7) / 100}",
@@ -160,7 +151,7 @@ def _check_memory(scene: Scene, needs: PhotoNeeds, free: int | None) -> None:
     if free is not None and free < wanted:
         smaller = math.floor((free - needs.training) / 1e7) / 100
         raise ConfigError(
-            scene.name,
+            needs.scene,
             expected=f"{_gb(wanted)} of memory, {_gb(needs.in_memory)} of it for photos",
             found=f"{_gb(free)} free",
             todo=f"use --photo-memory {smaller}"
@@ -186,10 +177,6 @@ def _check_disk(runs: Path, needs: PhotoNeeds, images: int) -> None:
             todo="choose a place on another disk, or make room there"
             + (f", or use --photo-disk {smaller}" if needs.on_disk else ""),
         )
-
-
-def _pixels(frame: Frame) -> int:
-    return math.prod(frame.camera.size)
 
 
 def _gb(size: int) -> str:

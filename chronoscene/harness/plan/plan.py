@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, product
 from pathlib import Path
 
-from chronoscene.checks import check_choice
-from chronoscene.errors import ConfigError
 from chronoscene.harness.files.ground_truth import freeze_ground_truth
-from chronoscene.harness.files.provenance import scene_hash
-from chronoscene.harness.files.source import read_bench_scene
+from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.checks import check_run
 from chronoscene.harness.plan.finished import continued, is_to_do
 from chronoscene.harness.plan.job import Job
-from chronoscene.harness.plan.memory import check_room, photo_needs
-from chronoscene.harness.plan.parts import check_points, check_scene, effective_strategy
-from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun, resolve_method
+from chronoscene.harness.plan.memory import check_room
+from chronoscene.harness.plan.parts import effective_strategy
+from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun, resolve_methods
+from chronoscene.harness.plan.scenes import BenchScene, read_scenes
 from chronoscene.harness.plan.settings import BenchSettings
-from chronoscene.images.store import ImageStore
 from chronoscene.io.log import Log
 from chronoscene.kernels.runtime import check_device
-from chronoscene.methods import load_spec
-from chronoscene.metrics.lpips_weights import check_available
-from chronoscene.scene import Scene
-from chronoscene.scene.splits import split_hash
 
 BUDGET_NOTICE = "--budget: schedules follow the clock, and equal seeds do not give equal models"
 
@@ -39,76 +32,32 @@ class Plan:
     todo: dict[Path, ResolvedRun]
     """Runs without a result when the plan was made."""
 
-    def update(self, other: Plan) -> None:
-        """Add the runs of another plan; a folder has one run."""
-        self.runs.update(other.runs)
-        self.todo.update(other.todo)
-
 
 def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     """Resolve and check all runs asked for; freezes the ground truth of the scenes."""
-    specs = [(reference, load_spec(reference)) for reference in settings.methods]
-    settings.check([spec.name for _, spec in specs])
-    shared = settings.run.absolute()
-    if shared.lpips_weights is not None:
-        check_available(shared.lpips_weights)
-    methods = [resolve_method(reference, spec, shared) for reference, spec in specs]
-    for _, spec in specs:
-        if shared.device != "auto":
-            check_choice(f"{spec.name} --device", shared.device, spec.devices)
+    shared = settings.run
+    methods = resolve_methods(settings.methods, shared)
     if settings.ray is None:  # else the machine that runs a job checks its own
         check_device(shared.device)
-    plan = Plan({}, {})
-    notices: dict[str, None] = {}
-    for scene in _read_scenes(settings, log):
-        log(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
-        store = ImageStore(scene, max_width=shared.max_width, memory_limit=shared.photo_memory)
-        needs = photo_needs(scene, store, shared)
-        memory = settings.job_memory or needs.of_run
-        runs = {run.job.folder: run for run in _runs_of_scene(settings, scene, methods, memory)}
-        todo = {k: run for k, run in runs.items() if is_to_do(run, settings.overwrite)}
-        trained = sum(run.spec.runner is None for run in todo.values())
-        if trained:
-            here = settings.ray is None
-            log(check_room(scene, needs, shared.runs, trained, here=here))
-        digest = next(iter(runs.values())).job.scene_hash
-        freeze_ground_truth(shared.runs, scene, digest, store, shared.max_width)
-        notices.update(dict.fromkeys(chain(*(run.job.notices for run in runs.values()))))
-        plan.update(Plan(runs, todo))
-    for notice in notices:
+    runs: dict[Path, ResolvedRun] = {}
+    todo: dict[Path, ResolvedRun] = {}
+    for scene in read_scenes(settings, log):
+        here = {run.job.folder: run for run in _runs_of_scene(settings, scene, methods)}
+        missing = {k: run for k, run in here.items() if is_to_do(run, settings.overwrite)}
+        if trained := sum(run.spec.runner is None for run in missing.values()):
+            log(check_room(scene.needs, shared.runs, trained, here=settings.ray is None))
+        freeze_ground_truth(shared.runs, scene.content, scene.hash, shared.max_width)
+        runs |= here
+        todo |= missing
+    for notice in dict.fromkeys(chain(*(run.job.notices for run in runs.values()))):
         log(f"note: {notice}")
-    return plan
-
-
-def _read_scenes(settings: BenchSettings, log: Log) -> Iterable[Scene]:
-    """Read all scenes before any of them is trained on; each has a name of its own."""
-    scenes: dict[str, Scene] = {}
-    for path in settings.scenes:
-        log(f"read {path}")
-        scene = read_bench_scene(
-            path,
-            format=settings.dataset_format,
-            period_by=settings.run.period_by,
-            validation=settings.run.validation,
-        )
-        if other := scenes.get(scene.name):
-            raise ConfigError(
-                scene.root,
-                expected="a scene with a unique name",
-                found=f"{scene.name!r}, the name of {other.root} too",
-                todo="rename a folder, or run the scenes with different --out",
-            )
-        scenes[scene.name] = scene
-        check_scene(scene)
-        check_points(scene)
-    return scenes.values()
+    return Plan(runs, todo)
 
 
 def _runs_of_scene(
-    settings: BenchSettings, scene: Scene, methods: list[ResolvedMethod], memory: int
+    settings: BenchSettings, scene: BenchScene, methods: list[ResolvedMethod]
 ) -> Iterator[ResolvedRun]:
     """Yield every method, strategy and seed on one scene, checked."""
-    digest, split = scene_hash(scene), split_hash(scene)
     for method, wanted, seed in product(methods, settings.strategies, settings.seeds):
         strategy, notices = _strategy(method, wanted)
         own = method.settings
@@ -116,19 +65,23 @@ def _runs_of_scene(
             notices.append(BUDGET_NOTICE)
         own = replace(own, keep_training=own.keep_training or settings.continue_to is not None)
         job = Job(
-            scene_root=str(scene.root.resolve()),
-            scene_format=scene.format,
-            scene=scene.name,
-            scene_hash=digest,
-            split_hash=split,
-            method=method.reference,
+            origin=RunOrigin(
+                method=method.reference,
+                plugin_path=str(Path.cwd()) if ":" in method.reference else None,
+                scene_root=str(scene.content.root.resolve()),
+                scene_format=scene.content.format,
+                period_by=scene.period_by,
+                validation=own.validation,
+            ),
+            scene=scene.content.name,
+            scene_hash=scene.hash,
+            split_hash=scene.split_hash,
             method_name=method.spec.name,
             strategy=strategy,
             seed=seed,
             settings=own,
             notices=notices,
-            plugin_path=str(Path.cwd()) if ":" in method.reference else None,
-            memory=memory,
+            memory=settings.job_memory or scene.needs.of_run,
         )
         run = method.run(job)
         check_run(run)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.provenance import config_hash
 from chronoscene.harness.files.strategies import STRATEGIES
@@ -128,20 +129,59 @@ class ResolvedRun:
         return tuple(self.stop.times(len(own)) for own in periods)
 
 
+def resolve_methods(references: Sequence[str], settings: RunSettings) -> list[ResolvedMethod]:
+    """Build the configurations of several methods for all runs of a bench.
+
+    Raises:
+        ConfigError: If a method does not exist, or as `check_overrides` and `resolve_method`.
+    """
+    specs = [load_spec(reference) for reference in references]
+    check_overrides(settings.overrides, [spec.name for spec in specs])
+    return [resolve_method(*pair, settings) for pair in zip(references, specs, strict=True)]
+
+
+def check_overrides(overrides: Mapping[str, str], names: Sequence[str]) -> None:
+    """Check that overrides name no method but those that are run.
+
+    Raises:
+        ConfigError: If one does.
+    """
+    for key in overrides:
+        method, dot, _ = key.rpartition(".")
+        if dot and method not in names:
+            raise ConfigError(
+                f"--set {key}",
+                expected=f"a key, or one after {', '.join(f'{n}.' for n in names)}",
+                found=repr(method),
+                todo="use the name of a method that is run",
+            )
+
+
+def overrides_of(overrides: Mapping[str, str], method: str) -> dict[str, str]:
+    """Return the options of one method; those with its name win over those of all."""
+    prefix = f"{method}."
+    common = {key: value for key, value in overrides.items() if "." not in key}
+    own = {k.removeprefix(prefix): v for k, v in overrides.items() if k.startswith(prefix)}
+    return common | own
+
+
 def resolve_method(reference: str, spec: MethodSpec, settings: RunSettings) -> ResolvedMethod:
     """Build the configuration of a method for all runs of a bench.
 
     Raises:
-        ConfigError: If a preset, key or value does not exist.
+        ConfigError: If a preset, key or value does not exist, or the method cannot use the device.
     """
-    settings = replace(settings, overrides=settings.overrides_of(spec.name))
+    settings = replace(settings, overrides=overrides_of(settings.overrides, spec.name))
     preset = deciding_options(build_config(spec, preset=settings.preset))
-    return ResolvedMethod(reference, spec, settings, _config(spec, settings), preset)
+    config = _config(spec, settings)
+    if settings.device != "auto":
+        check_choice(f"{spec.name} --device", settings.device, spec.devices)
+    return ResolvedMethod(reference, spec, settings, config, preset)
 
 
 def resolve(job: Job) -> ResolvedRun:
     """Resolve a planned job in the process that runs it."""
-    spec = load_spec(job.method)
+    spec = load_spec(job.origin.method)
     return ResolvedRun.of(job, spec, _config(spec, job.settings))
 
 

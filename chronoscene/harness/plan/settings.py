@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
+from chronoscene.formats import DetectedFormat, find_scenes
 from chronoscene.formats.shared.grouping import absolute_rule
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.methods import is_preset_file, preset_name
+from chronoscene.metrics.lpips_weights import check_available
 
 PHOTO_MEMORY = 2 * 10**9
 PHOTO_DISK = 20 * 10**9
@@ -25,7 +28,7 @@ one model of T periods gets them T times."""
 
 @dataclass(frozen=True, slots=True)
 class RunSettings:
-    """Settings that all runs of a bench share; every job has a copy."""
+    """Settings that all runs of a bench share; every job has a copy. Paths are absolute."""
 
     runs: Path
     """Folder of all runs."""
@@ -43,8 +46,6 @@ class RunSettings:
     threads: int | None = None
     device: str = "auto"
     """``auto``, ``cpu`` or ``cuda``."""
-    period_by: str | None = None
-    """Rule by which images are grouped into periods, as for `read_scene`."""
     validation: bool = False
     """True if views held back from the training views are scored, and test views are not read."""
     photo_memory: int = PHOTO_MEMORY
@@ -57,39 +58,17 @@ class RunSettings:
     """True if finished runs keep what it takes to train them further."""
     lpips_weights: Path | None = None
 
-    def absolute(self) -> RunSettings:
-        """Return the settings with paths that hold in every folder and process."""
-        weights, preset = self.lpips_weights, self.preset
-        return replace(
-            self,
-            preset=str(Path(preset).resolve()) if is_preset_file(preset) else preset,
-            runs=self.runs.resolve(),
-            period_by=absolute_rule(self.period_by),
-            lpips_weights=weights.resolve() if weights else None,
-        )
-
     @property
     def preset_name(self) -> str:
         """Name of the preset in results."""
         return preset_name(self.preset)
-
-    def overrides_of(self, method: str) -> dict[str, str]:
-        """Return the options of one method; those with its name win over those of all."""
-        prefix = f"{method}."
-        common = {key: value for key, value in self.overrides.items() if "." not in key}
-        own = {
-            key.removeprefix(prefix): value
-            for key, value in self.overrides.items()
-            if key.startswith(prefix)
-        }
-        return common | own
 
 
 @dataclass(frozen=True, slots=True)
 class BenchSettings:
     """A bench as the user asked for it."""
 
-    scenes: tuple[Path, ...]
+    scenes: tuple[DetectedFormat, ...]
     methods: tuple[str, ...]
     """Names, or ``module:SPEC``."""
     run: RunSettings
@@ -97,8 +76,6 @@ class BenchSettings:
     seeds: tuple[int, ...] = (0,)
     continue_to: int | None = None
     """Train finished runs further, up to this many iterations."""
-    dataset_format: str | None = None
-    """Format of the scenes; None to detect it."""
     overwrite: bool = False
     """True if finished runs with other settings may be replaced."""
     jobs: int | None = None
@@ -108,16 +85,12 @@ class BenchSettings:
     ray: str | None = None
     """Address of the Ray cluster to run on; None for this machine."""
 
-    def check(self, names: Sequence[str]) -> None:
+    def __post_init__(self) -> None:
         """Refuse settings that contradict each other.
 
-        Args:
-            names: Methods that are run.
-
         Raises:
-            ConfigError: If a strategy or a way of sharing is unknown, several options give a number
-                of iterations, of which one would win silently, or an override names a method that
-                is not run.
+            ConfigError: If a strategy or a way of sharing is unknown, or several options give a
+                number of iterations, of which one would win silently.
         """
         for strategy in self.strategies:
             check_choice("--strategy", strategy, STRATEGIES)
@@ -138,21 +111,44 @@ class BenchSettings:
                 found=" and ".join(options[1:]),
                 todo="leave all of them but one out",
             )
-        for key in overrides:
-            method, dot, _ = key.rpartition(".")
-            if dot and method not in names:
-                raise ConfigError(
-                    f"--set {key}",
-                    expected=f"a key, or one after {', '.join(f'{n}.' for n in names)}",
-                    found=repr(method),
-                    todo="use the name of a method that is run",
-                )
 
 
 def bench_settings(
-    scenes: tuple[Path, ...], methods: tuple[str, ...], runs: Path, **options: Any
+    scenes: Iterable[Path],
+    methods: tuple[str, ...],
+    runs: Path,
+    *,
+    preset: str = "balanced",
+    dataset_format: str | None = None,
+    period_by: str | None = None,
+    lpips_weights: Path | None = None,
+    **options: Any,
 ) -> BenchSettings:
-    """Make the settings of a bench from fields of both classes by their names."""
+    """Make the settings of a bench, with scenes and paths that hold in every folder and process.
+
+    Args:
+        scenes: Folders of scenes, or of folders that have scenes in them.
+        methods: As for `BenchSettings`.
+        runs: As ``preset`` and ``lpips_weights`` for `RunSettings`, in any form.
+        dataset_format: Format of the scenes; None to detect it.
+        period_by: Rule by which images are grouped into periods, as for `read_scene`.
+        options: Other fields of both classes, by their names.
+
+    Raises:
+        SceneError: If a folder has no scene.
+        ConfigError: If the format is unknown, or as `BenchSettings`.
+        MetricUnavailableError: If there are no weights of LPIPS at the place given.
+    """
+    if lpips_weights is not None:
+        check_available(lpips_weights)
+    rule = absolute_rule(period_by)
+    found = (find_scenes(folder, format=dataset_format, period_by=rule) for folder in scenes)
     ours = {one.name for one in fields(BenchSettings)} & options.keys()
-    run = RunSettings(runs, **{k: value for k, value in options.items() if k not in ours})
-    return BenchSettings(scenes, methods, run, **{name: options[name] for name in ours})
+    run = RunSettings(
+        runs.resolve(),
+        preset=str(Path(preset).resolve()) if is_preset_file(preset) else preset,
+        lpips_weights=lpips_weights.resolve() if lpips_weights else None,
+        **{k: value for k, value in options.items() if k not in ours},
+    )
+    shared = {name: options[name] for name in ours}
+    return BenchSettings(tuple(chain.from_iterable(found)), methods, run, **shared)

@@ -46,14 +46,14 @@ def open_pool(settings: BenchSettings) -> Iterator[Pool | None]:
     Raises:
         ConfigError: If there is no Ray, or no cluster.
     """
-    if settings.ray is not None:
-        from chronoscene.harness.run.ray_pool import open_ray
-
-        with open_ray(settings) as pool:
-            yield pool
-    else:
+    if settings.ray is None:
         jobs = settings.jobs or 1
         yield LocalPool(jobs) if jobs > 1 else None
+        return
+    from chronoscene.harness.run.ray_pool import open_ray
+
+    with open_ray(settings) as pool:
+        yield pool
 
 
 class LocalPool:

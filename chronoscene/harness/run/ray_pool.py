@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import chronoscene
+from chronoscene.checks import import_extra
 from chronoscene.errors import BackendError, ChronoSceneError, ConfigError
 from chronoscene.harness.files import records
 from chronoscene.harness.files.provenance import code_version
@@ -77,15 +78,7 @@ def open_ray(settings: BenchSettings) -> Iterator[RayPool]:
         ConfigError: If there is no Ray, or no cluster.
     """
     option = f"--ray {settings.ray}"
-    try:
-        import ray
-    except ImportError as error:
-        raise ConfigError(
-            option,
-            expected="the package ray",
-            found=str(error),
-            todo="pip install 'chronoscene[ray]'",
-        ) from error
+    ray = import_extra("ray", "ray", option)
     try:
         host, _, port = str(settings.ray).removeprefix("ray://").rpartition(":")
         if port.isdigit():  # Ray itself tries for over a minute
@@ -213,7 +206,8 @@ class RayPool:
         """Return True if a job gets a GPU: one that asks for it, or can use it where one is."""
         if job.settings.device != "auto":
             return job.settings.device == "cuda"
-        return "cuda" in load_spec(job.method).devices and any("GPU" in m for m in self._machines)
+        has_gpu = any("GPU" in machine for machine in self._machines)
+        return has_gpu and "cuda" in load_spec(job.origin.method).devices
 
     def _reason(self, error: Exception) -> str:
         """Return the reason why a run has no result."""

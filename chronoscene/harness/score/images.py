@@ -26,7 +26,7 @@ from chronoscene.harness.files.provenance import (
 from chronoscene.harness.plan.parts import check_scene
 from chronoscene.harness.score.scoring import score_run
 from chronoscene.images.decoding import image_size, load_opaque
-from chronoscene.images.store import ImageStore
+from chronoscene.images.store import evaluation_size
 from chronoscene.io.staging import staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.metrics.registry import Scorers
@@ -81,7 +81,7 @@ def find_images(folder: Path, scene: Scene, table: Path | None = None) -> dict[s
 
 
 def add_images(
-    writer: ImageWriter, frames: Sequence[Frame], images: Mapping[str, Path], store: ImageStore
+    writer: ImageWriter, frames: Sequence[Frame], images: Mapping[str, Path], max_width: int
 ) -> int:
     """Put images into a folder of predictions; return the number of resized ones.
 
@@ -93,7 +93,8 @@ def add_images(
     """
     resized = 0
     for frame in frames:
-        path, target = images[frame.name], store.camera(frame).size
+        path = images[frame.name]
+        target = evaluation_size(*frame.camera.size, max_width)
         size = image_size(path)
         if size not in (target, frame.camera.size):
             allowed = " or ".join(
@@ -196,8 +197,8 @@ def score_images(
             todo="choose another --name or --seed, or delete it",
         )
     images = find_images(folder, scene, table)
-    store, digest = ImageStore(scene, max_width=max_width), scene_hash(scene)
-    freeze_ground_truth(runs, scene, digest, store, max_width)
+    digest = scene_hash(scene)
+    freeze_ground_truth(runs, scene, digest, max_width)
     config = {
         "method": method,
         "preset": PRESET,
@@ -221,7 +222,7 @@ def score_images(
     )
     with staged_folder(out) as staging:
         writer = ImageWriter(staging / records.PREDICTIONS)
-        resized = add_images(writer, scene.select(split="test"), images, store)
+        resized = add_images(writer, scene.select(split="test"), images, max_width)
         details = {"name": name, "folder": str(folder.resolve()), "resized": resized}
         writer.close(kind="predictions", scene=scene.name, scene_hash=digest, details=details)
         if resized:

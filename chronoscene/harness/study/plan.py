@@ -17,6 +17,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RUN_FILE
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.plan import Plan, plan_runs
+from chronoscene.harness.plan.resolve import check_overrides, overrides_of
 from chronoscene.harness.plan.settings import SHARING, BenchSettings
 from chronoscene.harness.report.summary import COSTS
 from chronoscene.harness.run.local_pool import open_pool
@@ -161,7 +162,7 @@ def run_study(
     """
     methods = tuple(dict.fromkeys(row.method or study.method for row in study.rows))
     specs = {name: load_spec(name) for name in methods}
-    settings.check([spec.name for spec in specs.values()])
+    check_overrides(settings.run.overrides, [spec.name for spec in specs.values()])
     logged: set[str] = set()
 
     def once(line: str) -> None:
@@ -177,14 +178,15 @@ def run_study(
             changed = replace(
                 settings.run,
                 separate_iterations=row.separate_iterations,
-                overrides=settings.run.overrides_of(specs[method].name) | own,
+                overrides=overrides_of(settings.run.overrides, specs[method].name) | own,
             )
             asked = replace(settings, methods=(method,), strategies=(row.strategy,), run=changed)
             plans[row.label] = plan_runs(asked, once)
         _check_different(plans)
         plan = Plan({}, {})
         for row_plan in plans.values():
-            plan.update(row_plan)
+            plan.runs.update(row_plan.runs)
+            plan.todo.update(row_plan.todo)
         outcome = run_plan(plan, settings, log, execute=execute, pool=pool)
     finished = {
         label: [folder for folder in rows.runs if (folder / RUN_FILE).is_file()]

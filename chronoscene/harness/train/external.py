@@ -27,9 +27,9 @@ from chronoscene.formats.shared.ply import count_vertices
 from chronoscene.harness.files import records
 from chronoscene.harness.files.predictions import ImageWriter, encode_png
 from chronoscene.harness.files.provenance import method_version, processor_name
+from chronoscene.harness.files.source import write_source
 from chronoscene.harness.plan.checks import used_values
 from chronoscene.harness.plan.job import Job
-from chronoscene.harness.plan.memory import read_scene_of
 from chronoscene.harness.plan.parts import Part, make_parts
 from chronoscene.harness.plan.resolve import ResolvedRun
 from chronoscene.harness.plan.stop import StopRule
@@ -65,11 +65,11 @@ def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> Non
     job, spec = run.job, run.spec
     settings, staging = job.settings, Path(job.staging)
     write_text_atomic(staging / records.CONFIG_FILE, json.dumps(run.document, indent=1) + "\n")
-    scene = read_scene_of(job)
+    scene = job.origin.read_scene()
     parts = make_parts(
         scene, ImageStore(scene, max_width=settings.max_width, memory_limit=0), job.strategy
     )
-    job.write_source(parts[0].train.training_from_world)
+    write_source(staging, job.origin, parts[0].train.training_from_world)
     writer = ImageWriter(staging / records.PREDICTIONS)
     stops = run.stops(parts)
     trained = []
@@ -78,6 +78,7 @@ def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> Non
             model = " ".join(filter(None, ("trains", part.subfolder)))
             display.wait(f"{spec.title} {model}; what it prints goes to {staging / LOG}")
             trained.append(_run_part(run, runner, scene, part, stop, writer))
+    versions = method_version(job.origin.method), trained[0].version
     primitives = [model.primitives for model in trained]
     iterations = [stop.iterations for stop in stops]
     record = foreign_record(
@@ -97,7 +98,7 @@ def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> Non
         peak_memory_bytes=max(model.peak_memory_bytes for model in trained) or None,
         device=f"the program's choice, {processor_name()}",
         commit=job.commit,
-        method_version="; ".join(filter(None, (method_version(job.method), trained[0].version))),
+        method_version="; ".join(filter(None, versions)),
         config_hash=run.document["config_hash"],
         scene_hash=job.scene_hash,
         max_width=settings.max_width,
@@ -150,7 +151,7 @@ def _run_part(
         usage = execute(runner.train)
         peaks = [usage.peak_memory_bytes, *(execute(c).peak_memory_bytes for c in runner.render)]
         images = _find_images(runner, output, part.test, names, values)
-        add_images(writer, part.test, images, part.store)
+        add_images(writer, part.test, images, job.settings.max_width)
         primitives = _keep_model(job, runner, output, part, values)
     finally:
         shutil.rmtree(work, ignore_errors=True)

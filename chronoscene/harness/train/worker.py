@@ -30,9 +30,10 @@ from chronoscene.harness.files.provenance import (
     peak_memory_bytes,
 )
 from chronoscene.harness.files.records import CurvePoint
+from chronoscene.harness.files.source import write_source
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.job import Job
-from chronoscene.harness.plan.memory import open_store, read_scene_of
+from chronoscene.harness.plan.memory import open_store
 from chronoscene.harness.plan.parts import Part, make_parts
 from chronoscene.harness.plan.resolve import ResolvedRun, resolve
 from chronoscene.harness.plan.stop import StopRule
@@ -99,11 +100,11 @@ def run_job(job: Job, report: Report | None = None) -> None:
     settings = job.settings
     machine = Machine(pick_device(settings.device, run.spec), set_threads(settings.threads))
     write_text_atomic(staging / records.CONFIG_FILE, dumps(run.document, indent=1) + "\n")
-    scene = read_scene_of(job)
+    scene = job.origin.read_scene()
     takes_period = run.spec.period_input != "none"
     store = open_store(scene, settings)
     parts = make_parts(scene, store, job.strategy, takes_period=takes_period)
-    job.write_source(parts[0].train.training_from_world)
+    write_source(staging, job.origin, parts[0].train.training_from_world)
     # All stages but the last have folders of their own, as they predict the same views.
     stages = [part.name for part in parts[:-1]] if STRATEGIES[job.strategy].in_order else []
     writers = {name: ImageWriter(staging / records.STAGES / name) for name in stages}
@@ -326,7 +327,7 @@ def _record(
         title=spec.title_of(job.settings.preset_name),
         preset=job.settings.preset_name,
         variant=job.variant,
-        method_version=method_version(job.method),
+        method_version=method_version(job.origin.method),
         config_hash=run.document["config_hash"],
         scene_hash=job.scene_hash,
         split_hash=job.split_hash,
@@ -359,8 +360,8 @@ def execute(document: dict[str, Any], report: Report) -> None:
     """Run the job in ``document``; every failure ends in ``failed.json``."""
     job = replace(Job.from_document(document), commit=code_version())
     staging = Path(job.staging)
-    if job.plugin_path is not None:
-        sys.path.append(job.plugin_path)
+    if job.origin.plugin_path is not None:
+        sys.path.append(job.origin.plugin_path)
     try:
         with needing_space(job.folder):
             run_job(job, report if job.reports else None)

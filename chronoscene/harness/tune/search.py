@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock, Timeout
 
+from chronoscene.checks import import_extra
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files import records
 from chronoscene.harness.files.provenance import scene_hash
@@ -129,27 +130,18 @@ def _alone(out: Path) -> Iterator[None]:
 
 def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
     """Open the study of a folder, or begin it with the preset as its first trial."""
-    try:
-        import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
-    except ImportError as error:
-        raise ConfigError(
-            "chronoscene tune",
-            expected="the package optuna",
-            found=str(error),
-            todo="pip install 'chronoscene[tune]'",
-        ) from error
-    settings = replace(settings, run=replace(settings.run.absolute(), validation=True))
+    optuna = import_extra("optuna", "tune", "chronoscene tune")
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
+    settings = replace(settings, run=replace(settings.run, validation=True))
     (reference,), (seed,), run = settings.methods, settings.seeds, settings.run
     method = resolve_method(reference, load_spec(reference), run)
     start = starting_point(method.spec, method.config)
     scenes = []
-    for path in settings.scenes:
-        log(f"read {path}")
-        scene = read_bench_scene(
-            path, format=settings.dataset_format, period_by=run.period_by, validation=True
-        )
+    for found in settings.scenes:
+        log(f"read {found.path}")
+        scene = read_bench_scene(found, validation=True)
         scenes.append({"name": scene.name, "hash": scene_hash(scene)})
     ours = {
         "method": method.spec.name,

@@ -112,18 +112,12 @@ def make_file(
         kind: Format, of `chronoscene.splat_files.SUFFIXES`.
     """
     up = find_up(np.stack([frame.cam_from_world for frame in scene.frames]))
-    antialiased = prepared.antialiased
-
-    def encode(comments: tuple[str, ...]) -> bytes:
-        return splat_files.encode(
-            kind, prepared.cloud, antialiased=antialiased, comments=comments, up=up
-        )
-
-    read = splat_files.decode(kind, encode(()))
+    data = splat_files.encode(kind, prepared.cloud, antialiased=prepared.antialiased, up=up)
+    read = splat_files.decode(kind, data)
     in_training = read.transformed(run.training_from_local(prepared.offset))
     loss = measure_loss(run, scene, period, in_training, _frames(scene, "test", period))
     comments = _comments(run, scene, period, prepared, loss)
-    return Export(encode(comments), loss, comments)
+    return Export(splat_files.with_comments(kind, data, comments), loss, comments)
 
 
 def local_offset(scene: Scene) -> NDArray[np.float64]:

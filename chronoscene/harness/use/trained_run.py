@@ -20,7 +20,7 @@ from chronoscene.harness.files.records import (
     read_config,
     read_run,
 )
-from chronoscene.harness.files.source import RunSource, read_bench_scene, read_source
+from chronoscene.harness.files.source import RunSource, read_source
 from chronoscene.harness.files.strategies import STRATEGIES, Strategy, period_part
 from chronoscene.harness.score.views import PredictedView, read_views
 from chronoscene.images.store import ImageStore
@@ -319,13 +319,7 @@ class TrainedRun:
         """
         place, found = root or Path(self.source.scene_root), "nothing"
         if place.exists():
-            source = self.source
-            scene = read_bench_scene(
-                place,
-                format=source.scene_format,
-                period_by=source.period_by,
-                validation=source.validation,
-            )
+            scene = self.source.read_scene(root)
             if scene_hash(scene) == self.record.scene_hash:
                 return scene
             found = "another scene, or a changed one"

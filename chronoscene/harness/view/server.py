@@ -11,6 +11,7 @@ import warnings
 from contextlib import redirect_stdout
 from typing import TYPE_CHECKING
 
+from chronoscene.checks import import_extra
 from chronoscene.errors import ConfigError
 from chronoscene.harness.view.content import Content
 from chronoscene.harness.view.panel import Viewer
@@ -67,15 +68,7 @@ class ViewServer:
         Raises:
             ConfigError: If viser is missing.
         """
-        try:
-            import viser
-        except ImportError as error:
-            raise ConfigError(
-                "chronoscene view",
-                expected="the package viser",
-                found=str(error),
-                todo="pip install 'chronoscene[view]'",
-            ) from error
+        viser = import_extra("viser", "view", "chronoscene view")
         self.viewers: dict[int, Viewer] = {}
         """Browsers that are connected, by their number."""
         self._content = content
@@ -88,7 +81,7 @@ class ViewServer:
         self.port = self._server.get_port()
         """Another one than asked for if that was taken in the meantime."""
         # Any browser can ask viser for a public address, through a machine of others.
-        self._server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
+        self._server.request_share_url = lambda verbose=True: None
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         camera = self._server.initial_camera
         camera.position, camera.look_at, up = content.start()

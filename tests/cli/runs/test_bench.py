@@ -16,6 +16,7 @@ from chronoscene.cli import cli
 from chronoscene.errors import BackendError, ConfigError, SceneError
 from chronoscene.harness.files.records import Failure
 from chronoscene.harness.run.runner import BenchOutcome
+from chronoscene.metrics.lpips_weights import BACKBONE_FILE
 
 PLUGINS = Path(__file__).parents[2] / "harness" / "plugins"
 IMAGES = {f"{folder}/{i}.png": period for period, folder in enumerate("ab") for i in range(3)}
@@ -112,13 +113,17 @@ def settings(monkeypatch):
 
 def test_scenes_in_folders_and_nearby(make_scene_folder, tmp_path, settings, monkeypatch):
     scenes = tuple(make_scene_folder(name=f"data/{name}") for name in ("one", "two"))
+
+    def found(*arguments):
+        return tuple(scene.path for scene in settings(*arguments, "--method", "3dgs").scenes)
+
     for given in (scenes, [tmp_path / "data"]):
-        assert settings(*map(str, given), "--method", "3dgs").scenes == scenes
+        assert found(*map(str, given)) == scenes
     for here in (tmp_path, tmp_path / "data"):
         monkeypatch.chdir(here)
-        assert settings("--method", "3dgs").scenes == scenes
+        assert found() == scenes
     monkeypatch.chdir(scenes[0])
-    assert settings("--method", "3dgs", "--out", str(tmp_path / "r")).scenes == scenes[:1]
+    assert found("--out", str(tmp_path / "r")) == scenes[:1]
 
 
 @pytest.mark.parametrize("command", [["bench", "--method", "3dgs"], ["stats"]])
@@ -135,7 +140,7 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
     make_scene_folder, tmp_path, monkeypatch, set_gsplat
 ):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    reader = "chronoscene.harness.plan.plan.read_bench_scene"
+    reader = "chronoscene.harness.plan.scenes.read_bench_scene"
     monkeypatch.setattr(reader, lambda *args, **options: pytest.fail("read"))
     command = ["bench", str(make_scene_folder()), "--method", "3dgs", "--out", str(tmp_path / "r")]
     result = CliRunner().invoke(cli, [*command, "--device", "cuda"])
@@ -161,9 +166,14 @@ def test_help_does_not_promise_equal_models_of_budgets(option):
 def test_defaults(settings, make_scene_folder):
     scene = make_scene_folder()
     asked = settings(str(scene), "--method", "chronogs")
-    assert asked.scenes == (scene,) and asked.methods == ("chronogs",)
+    assert [found.path for found in asked.scenes] == [scene]
+    assert asked.methods == ("chronogs",)
     assert asked.strategies == ("joint",) and asked.run.preset == "balanced"
-    assert asked.seeds == (0,) and asked.run.runs == Path("runs") and asked.run.max_width == 1600
+    assert (
+        asked.seeds == (0,)
+        and asked.run.runs == Path("runs").resolve()
+        and asked.run.max_width == 1600
+    )
     assert (
         asked.run.iterations is None
         and asked.run.budget_seconds is None
@@ -181,6 +191,7 @@ def test_devices_of_a_cluster_are_not_looked_for_here(settings, make_scene_folde
 
 
 def test_every_option_arrives(settings, tmp_path):
+    (tmp_path / BACKBONE_FILE).write_bytes(bytes(1_000_001))
     asked = settings(
         "a", "b", "--method", "3dgs, chronogs,3dgs", "--strategy", "joint,separate",
         "--preset", "fast", "--budget", "1m30s", "--iterations", "7", "--seeds", "2",
@@ -191,14 +202,15 @@ def test_every_option_arrives(settings, tmp_path):
         "--jobs", "4", "--job-memory", "1.5",
     )  # fmt: skip
     assert (asked.jobs, asked.job_memory, asked.ray) == (4, 1_500_000_000, None)
-    assert asked.scenes == (Path("a"), Path("b")) and asked.methods == ("3dgs", "chronogs")
+    found = [(scene.path, scene.name, scene.period_by) for scene in asked.scenes]
+    assert found == [(Path("a"), "wat", "year"), (Path("b"), "wat", "year")]
+    assert asked.methods == ("3dgs", "chronogs")
     assert asked.strategies == ("joint", "separate") and asked.run.preset == "fast"
     assert asked.run.budget_seconds == 90 and asked.run.iterations == 7 and asked.seeds == (5, 6)
     assert asked.run.overrides == {"x": "1", "chronogs.y": "a=b"}
     assert (asked.run.max_width, asked.run.threads, asked.run.device) == (320, 3, "cpu")
     assert asked.run.separate_iterations == "each" and asked.overwrite
-    assert asked.dataset_format == "wat" and asked.run.period_by == "year"
-    assert asked.run.lpips_weights == tmp_path and asked.run.runs == Path("elsewhere")
+    assert asked.run.lpips_weights == tmp_path and asked.run.runs == Path("elsewhere").resolve()
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.command_line import command_line
+from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.resolve import resolve, resolve_method
 from chronoscene.harness.plan.settings import RunSettings
@@ -19,10 +20,14 @@ from chronoscene.harness.plan.stop import StopRule, parse_duration
 from chronoscene.methods import load_spec
 
 JOB = Job(
-    scene_root="/scene", scene_format="chronoscene", scene="scene", scene_hash="1", split_hash="2",
-    method="toy_methods:MEAN", method_name="mean", strategy="separate", seed=0, commit="3",
+    origin=RunOrigin(method="toy_methods:MEAN", scene_root="/scene", scene_format="chronoscene"),
+    scene="scene", scene_hash="1", split_hash="2",
+    method_name="mean", strategy="separate", seed=0, commit="3",
     settings=RunSettings(Path("/runs"), iterations=9, device="cpu"),
 )  # fmt: skip
+
+
+COPY = JOB.origin.model_copy(update={"scene_root": "/copy"})
 
 
 def changed(change: dict[str, Any]) -> Job:
@@ -101,7 +106,7 @@ def test_what_decides_the_result_is_compared(change):
 
 
 def test_where_and_how_fast_it_runs_is_not_compared():
-    other = changed({"runs": Path("/other"), "threads": 3, "commit": "5", "scene_root": "/copy"})
+    other = changed({"runs": Path("/other"), "threads": 3, "commit": "5", "origin": COPY})
     assert resolve(other).document == resolve(JOB).document
 
 
@@ -130,14 +135,14 @@ def test_folders_have_names_that_file_systems_take():
 )
 def test_variants_are_named_by_what_differs_from_the_preset(changes, variant):
     job = changed(changes)
-    method = resolve_method(job.method, load_spec(job.method), job.settings)
+    method = resolve_method(job.origin.method, load_spec(job.origin.method), job.settings)
     assert method.run(job).job.variant == variant
 
 
 def test_a_budget_of_each_model_is_named_though_the_preset_has_it():
     settings = replace(JOB.settings, overrides={}, iterations=None, budget_seconds=90.0)
-    job = replace(JOB, method="toy_methods:DATED", strategy="separate", settings=settings)
-    method = resolve_method(job.method, load_spec(job.method), settings)
+    job = replace(JOB, strategy="separate", settings=settings)
+    method = resolve_method("toy_methods:DATED", load_spec("toy_methods:DATED"), settings)
     assert method.run(job).job.variant == "budget=90s,separate_iterations=each"
 
 

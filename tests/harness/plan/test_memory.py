@@ -43,42 +43,38 @@ def free(monkeypatch):
     return free
 
 
-def needs_of(scene, settings):
-    return photo_needs(scene, ImageStore(scene, max_width=settings.max_width), settings)
-
-
 def room(scene, settings, runs, **options):
-    return check_room(scene, needs_of(scene, settings), settings.runs, runs, **options)
+    return check_room(photo_needs(scene, settings), settings.runs, runs, **options)
 
 
 def test_the_estimate_counts_photos_masks_and_decoding(make_scene, settings, tmp_path):
     scene = make_scene()
-    needs = needs_of(scene, settings)
+    needs = photo_needs(scene, settings)
     assert (needs.count, needs.total, needs.largest) == (5, 5 * PHOTO, PHOTO)
     assert (needs.decoding, needs.decoders) == (DECODING, 2)
     assert needs.in_memory == 5 * PHOTO + 2 * DECODING and needs.on_disk == 0
     masked = replace(scene, masks={"a/0.png": tmp_path / "m.png"})
-    assert needs_of(masked, settings).total == 5 * PHOTO + PIXELS
+    assert photo_needs(masked, settings).total == 5 * PHOTO + PIXELS
     settings.max_width = 12
-    assert needs_of(scene, settings).largest == PHOTO // 4
+    assert photo_needs(scene, settings).largest == PHOTO // 4
 
 
 def test_what_does_not_fit_goes_to_the_disk(make_scene, settings):
     settings.photo_memory = 5 * PHOTO + DECODING
-    needs = needs_of(make_scene(), settings)
+    needs = photo_needs(make_scene(), settings)
     assert needs.decoders == 1 and needs.on_disk == 0
     settings.photo_memory -= 1
-    needs = needs_of(make_scene(), settings)
+    needs = photo_needs(make_scene(), settings)
     assert needs.on_disk == 5 * PHOTO and needs.in_memory == settings.photo_memory
     settings.photo_disk = 100
-    assert needs_of(make_scene(), settings).on_disk == 100
+    assert photo_needs(make_scene(), settings).on_disk == 100
 
 
 def test_half_of_the_threads_decode_if_memory_allows_it(make_scene, settings):
     settings.threads = 12
-    assert needs_of(make_scene(), settings).decoders == 6
+    assert photo_needs(make_scene(), settings).decoders == 6
     settings.photo_memory = 8 * DECODING
-    assert needs_of(make_scene(), settings).decoders == 4
+    assert photo_needs(make_scene(), settings).decoders == 4
 
 
 def test_the_line_says_what_is_taken(make_scene, settings, free):
@@ -95,7 +91,7 @@ def test_memory_counts_where_the_run_will_be(make_scene, settings, free):
     with pytest.raises(ConfigError, match=r"expected 0\.50 GB of memory"):
         room(make_scene(), settings, runs=1)
     room(make_scene(), settings, runs=1, here=False)
-    assert 1.50e9 < needs_of(make_scene(), settings).of_run < 1.51e9
+    assert 1.50e9 < photo_needs(make_scene(), settings).of_run < 1.51e9
 
 
 def big(scene):

@@ -12,6 +12,7 @@ from chronoscene.formats import read_scene
 from chronoscene.harness.plan import resolve
 from chronoscene.harness.plan.finished import first_difference
 from chronoscene.harness.plan.plan import plan_runs
+from chronoscene.harness.plan.resolve import overrides_of
 from chronoscene.harness.plan.settings import RunSettings, bench_settings
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.scene import Points
@@ -25,8 +26,8 @@ def test_differences_are_named():
 
 def test_overrides_with_a_prefix_are_for_one_method(tmp_path):
     settings = RunSettings(tmp_path, overrides={"blind.rate": "1", "rate": "2"})
-    assert settings.overrides_of("mean") == {"rate": "2"}
-    assert settings.overrides_of("blind") == {"rate": "1"}
+    assert overrides_of(settings.overrides, "mean") == {"rate": "2"}
+    assert overrides_of(settings.overrides, "blind") == {"rate": "1"}
 
 
 def test_planning_builds_each_configuration_once(scene_folder, tmp_path, monkeypatch):

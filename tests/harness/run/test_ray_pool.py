@@ -14,6 +14,7 @@ from training_here import execute_here
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import read_run
+from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.settings import bench_settings
 from chronoscene.harness.run import ray_pool
 from chronoscene.harness.run.runner import run_bench
@@ -217,8 +218,9 @@ def test_runs_get_what_the_machines_of_a_cluster_have(tmp_path):
         return ray_pool.RayPool(SimpleNamespace(nodes=lambda: nodes), settings, tmp_path)
 
     assert pool().at_once == 3 and pool(threads=4).at_once == 5 and pool(jobs=2).at_once == 2
-    job = replace(JOB, method="3dgs").with_settings(device="auto")
+    either, toy = RunOrigin(method="3dgs", scene_root="", scene_format=""), JOB.origin
+    job = replace(JOB, origin=either).with_settings(device="auto")
     assert pool()._on_gpu(job) and pool()._on_gpu(job.with_settings(device="cuda"))
     assert not pool()._on_gpu(job.with_settings(device="cpu")) and not pool()._on_gpu(JOB)
     machines[0].pop("GPU")
-    assert not pool()._on_gpu(job) and not pool()._on_gpu(replace(job, method="toy_methods:MEAN"))
+    assert not pool()._on_gpu(job) and not pool()._on_gpu(replace(job, origin=toy))

@@ -131,8 +131,8 @@ def test_the_command_writes_a_folder(run, scene, tmp_path):
     ("names", "message"),
     [
         (("0", "spring"), "--between 0 spring: expected two periods .*, found the same one twice"),
-        (("0", "0.5"), "found a time between them"),
-        (("0", "2"), "period 2: expected one from 0 to 1"),
+        (("0", "0.5"), "found an unknown one"),
+        (("0", "2"), "found an unknown one; choose among 0 .spring., 1"),
     ],
 )
 def test_what_is_no_pair_of_periods(run, tmp_path, names, message):

@@ -139,7 +139,7 @@ def test_periods_in_between_need_a_continuous_method_that_saw_all(runs, strategy
         (SOURCE_FILE, "{}", "expected what bench wrote"),
         (SOURCE_FILE, "[", "expected what bench wrote"),
         (CONFIG_FILE, None, "expected the config of the run"),
-        (CONFIG_FILE, "{}", "expected the config of the run"),
+        (CONFIG_FILE, "{}", "expected what bench wrote, found Field required"),
         (CONFIG_FILE, '{"config": {"method_config": {"of": "another"}}}', "mean: configuration"),
         ("run.json", None, "expected a finished run"),
         ("checkpoint/model.json", None, "model"),

@@ -1,0 +1,55 @@
+"""Scenes of a bench: all are read and checked before anything is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.provenance import scene_hash
+from chronoscene.harness.files.source import read_bench_scene
+from chronoscene.harness.plan.memory import PhotoNeeds, photo_needs
+from chronoscene.harness.plan.parts import check_points, check_scene
+from chronoscene.harness.plan.settings import BenchSettings
+from chronoscene.io.log import Log
+from chronoscene.scene import Scene
+from chronoscene.scene.splits import split_hash
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BenchScene:
+    """A scene with all that its runs need to know of it."""
+
+    content: Scene
+    period_by: str | None
+    """Rule by which its images were grouped into periods."""
+    hash: str
+    split_hash: str
+    needs: PhotoNeeds
+
+
+def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
+    """Read all scenes of a bench, then yield each with its fingerprints.
+
+    Raises:
+        SceneError: If one cannot be read or trained on.
+        ConfigError: If two have the same name.
+    """
+    scenes: dict[str, tuple[Scene, str | None]] = {}
+    for found in settings.scenes:
+        log(f"read {found.path}")
+        scene = read_bench_scene(found, validation=settings.run.validation)
+        if scene.name in scenes:
+            raise ConfigError(
+                scene.root,
+                expected="a scene with a unique name",
+                found=f"{scene.name!r}, the name of {scenes[scene.name][0].root} too",
+                todo="rename a folder, or run the scenes with different --out",
+            )
+        check_scene(scene)
+        check_points(scene)
+        scenes[scene.name] = scene, found.period_by
+    for scene, period_by in scenes.values():
+        log(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
+        needs = photo_needs(scene, settings.run)
+        yield BenchScene(scene, period_by, scene_hash(scene), split_hash(scene), needs)
