@@ -249,7 +249,7 @@ def _inside(points: Points, box: Box) -> NDArray[np.bool_]:
             "--crop",
             expected="points in the box",
             found=found,
-            todo="choose a box in the world of the scene: chronoscene stats --figures shows it",
+            todo="choose a box in the world of the scene: chronoscene stats --pages shows it",
         )
     return inside
 

@@ -52,6 +52,7 @@ CASES = (
     Case("stats, one scene", ("stats", f"DATA/{SCENE}")),
     Case("stats, all", ("stats", "DATA"), seconds=15.0),
     Case("figures, one scene", ("stats", f"DATA/{SCENE}", "--figures", "OUT"), seconds=3.0),
+    Case("page, one scene", ("stats", f"DATA/{SCENE}", "--pages", "OUT")),
     Case("figures, all", ("stats", "DATA", "--figures", "OUT")),
 )
 

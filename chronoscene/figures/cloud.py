@@ -1,4 +1,4 @@
-"""Points and cameras that figures show, and the part of space that is shown."""
+"""Points and cameras that figures and pages show, and the part of space that is shown."""
 
 from __future__ import annotations
 
@@ -53,6 +53,8 @@ class Cloud:
     """Camera centres. [C, 3]"""
     directions: Array
     """Viewing directions. [C, 3]"""
+    tops: Array
+    """Directions that are up in the images. [C, 3]"""
     camera_period: NDArray[np.int64]
     """[C]"""
 
@@ -68,6 +70,7 @@ def cloud_of(scene: Scene) -> Cloud:
         period=assign_points(scene.count_views()),
         centres=camera_centre(poses),
         directions=poses[:, 2, :3],
+        tops=-poses[:, 1, :3],
         camera_period=scene.frame_periods,
     )
 

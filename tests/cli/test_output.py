@@ -21,7 +21,7 @@ def places(make_scene_folder: Callable[[], Path], tmp_path: Path) -> Path:
     """A scene, photos, a file where a folder should be, and folders where files should be."""
     make_scene_folder()
     (tmp_path / "file").touch()
-    for folder in ("folder", "figures/counts.png", "drawn/scene_points.svg"):
+    for folder in ("folder", "figures/counts.png", "drawn/scene_points.svg", "pages/scene.html"):
         (tmp_path / folder).mkdir(parents=True)
     for period in "ab":
         (tmp_path / "photos" / period).mkdir(parents=True)
@@ -39,6 +39,8 @@ def places(make_scene_folder: Callable[[], Path], tmp_path: Path) -> Path:
         ("stats scene --figures file/new", "--figures file/new"),
         ("stats scene --figures figures", "--figures figures/counts.png"),
         ("stats scene --figures drawn --figure-format svg", "--figures drawn/scene_points.svg"),
+        ("stats scene --pages file", "--pages file"),
+        ("stats scene --pages pages", "--pages pages/scene.html"),
         ("split scene file/new", "OUT file/new"),
         ("split scene --scene-out file/new", "--scene-out file/new"),
         ("register photos file/new", "OUT file/new"),
@@ -71,6 +73,7 @@ def test_the_option_is_named(
         "split scene --scene-out",
         "stats scene --out",
         "stats scene --figures",
+        "stats scene --pages",
         "undistort scene",
         "validate scene --out",
         "validate scene --html",

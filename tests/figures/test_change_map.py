@@ -14,7 +14,7 @@ from chronoscene.harness.use.changes import CLASSES
 def cloud():
     up = np.array([[0.0, 0.0, 1.0]])
     xyz = np.random.default_rng(0).uniform([-20, -10, 0], [20, 10, 4], (3000, 3))
-    rows = {"centres": 50 * up, "directions": -up}
+    rows = {"centres": 50 * up, "directions": -up, "tops": np.array([[0.0, 1.0, 0.0]])}
     period, camera_period = np.zeros(3000, int), np.zeros(1, int)
     return Cloud("place", "metre", ("0",), xyz, period, **rows, camera_period=camera_period)
 

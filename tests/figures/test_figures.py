@@ -36,6 +36,7 @@ def cloud_with(xyz: np.ndarray, period: np.ndarray, periods: int = 3) -> Cloud:
         period=period,
         centres=np.array([[0.0, 0.0, 50.0 + i] for i in range(periods)]),
         directions=np.tile([0.0, 0.0, -1.0], (periods, 1)),
+        tops=np.tile([0.0, 1.0, 0.0], (periods, 1)),
         camera_period=np.arange(periods),
     )
 

@@ -1,4 +1,4 @@
-"""``chronoscene stats``: tables and figures of scenes, by period."""
+"""``chronoscene stats``: tables, figures and pages of scenes, by period."""
 
 from __future__ import annotations
 
@@ -61,10 +61,15 @@ class StatsRequest:
     figures: Path | None
     figure_format: str
     cameras: bool
+    pages: Path | None
 
     def figure(self, name: str) -> Path | None:
         """Return the file of a figure; None if no figures are asked for."""
         return self.figures and self.figures / f"{name}.{self.figure_format}"
+
+    def page(self, name: str) -> Path | None:
+        """Return the file of a page; None if no pages are asked for."""
+        return self.pages and self.pages / f"{name}.html"
 
 
 @click.command("stats")
@@ -97,6 +102,12 @@ class StatsRequest:
     help="File format of the figures.",
 )
 @click.option("--cameras", is_flag=True, help="Also draw the cameras in the figures.")
+@click.option(
+    "--pages",
+    type=PATH,
+    metavar="OUT",
+    help="Write an interactive page of each scene, for a browser, to this folder.",
+)
 @reading_options("the scenes")
 @click.pass_context
 def command(
@@ -145,9 +156,8 @@ def command(
                 draw_bars(counts, bars)
             written = [bars]
         for (_, name), result in zip(items, results, strict=True):
-            figure = request.figure(f"{name}_points")
-            if figure is not None and not isinstance(result, Unreadable):
-                written.append(figure)
+            if not isinstance(result, Unreadable):
+                written += filter(None, (request.figure(f"{name}_points"), request.page(name)))
         report_written(*written)
     notes = (f"{s.name}: {n}" for s in counts for n in detect(Path(s.path), format=s.format).notes)
     for remark in [*notes, *unseen(counts), *against_paper(counts)]:
@@ -165,7 +175,7 @@ def examine(
 
     Args:
         request: What to do.
-        item: Folder of the scene, and the name of its figure.
+        item: Folder of the scene, and the name of its figure and page.
     """
     path, name = item
     keep_freed_memory()  # arrays as large as the model come and go
@@ -181,6 +191,11 @@ def examine(
 
         with writing_to("--figures", figure):
             draw_cloud(cloud_of(scene), figure, cameras=request.cameras)
+    if (page := request.page(name)) is not None:
+        from chronoscene.figures.viewer import write_page
+
+        with writing_to("--pages", page):
+            write_page(scene, page)
     if request.layout == "paper":
         return count_scene(scene, count=request.count)
     return measure_scene(scene, count=request.count)
@@ -216,15 +231,16 @@ def _file_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _check_places(request: StatsRequest, out: Path | None, paths: Sequence[Path]) -> None:
-    """Make the folder for figures; refuse to write into a scene."""
+    """Make the folders for figures and pages; refuse to write into a scene."""
     if out is not None:
         check_outside(out, paths, option="--out")
     check_file("--out", out)
-    if request.figures is not None:
-        check_outside(request.figures, paths, option="--figures")
-        with writing_to("--figures", request.figures, expected="a folder that can be made"):
-            request.figures.mkdir(parents=True, exist_ok=True)
-        check_place("--figures", request.figures)
+    for option, place in (("--figures", request.figures), ("--pages", request.pages)):
+        if place is not None:
+            check_outside(place, paths, option=option)
+            with writing_to(option, place, expected="a folder that can be made"):
+                place.mkdir(parents=True, exist_ok=True)
+            check_place(option, place)
 
 
 def unseen(counts: Sequence[SceneCount]) -> Iterator[str]:

@@ -256,29 +256,33 @@ def test_names_that_are_not_text(make_scene_folder, tmp_path):
         assert result.exit_code == 0, result.exception
         assert "bad" in (tmp_path / "table").read_text(encoding="utf-8")
     out = tmp_path / "out"
-    result = run(folder, "--figures", out, "--figure-format", "svg")
+    result = run(folder, "--figures", out, "--pages", out, "--figure-format", "svg")
     assert result.exit_code == 0, result.exception
-    assert len(list(out.iterdir())) == 2
+    assert len(list(out.iterdir())) == 3
 
 
-def test_figures_of_every_scene(make_scene_folder, tmp_path, one_process):
+def test_figures_and_pages_of_every_scene(make_scene_folder, tmp_path, one_process):
     folders = [make_scene_folder(name=name) for name in ("one/place", "two/place", "hill")]
     out = tmp_path / "out" / "deep"
-    options = ["--figures", out, "--figure-format", "svg", "--cameras"]
+    options = ["--figures", out, "--figure-format", "svg", "--cameras", "--pages", out / "pages"]
     result = run(*folders, *options)
     assert result.exit_code == 0, result.output
     assert sorted(str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()) == [
         "counts.svg",
         "hill_points.svg",
+        "pages/hill.html",
+        "pages/place.html",
+        "pages/place_2.html",
         "place_2_points.svg",
         "place_points.svg",
     ]
     assert result.stdout.count("place") == 2
 
 
-def test_nothing_is_drawn_into_a_scene(make_scene_folder):
+@pytest.mark.parametrize("option", ["--figures", "--pages"])
+def test_nothing_is_drawn_into_a_scene(make_scene_folder, option):
     folder = make_scene_folder()
-    result = run(folder, "--figures", folder / "figures")
+    result = run(folder, option, folder / "figures")
     assert "nothing is written into a dataset" in str(result.exception)
     assert not (folder / "figures").exists()
 
