@@ -33,6 +33,7 @@ def places(make_scene_folder: Callable[[], Path], tmp_path: Path) -> Path:
     ("words", "place"),
     [
         ("validate scene --out folder", "--out folder"),
+        ("validate scene --sarif folder", "--sarif folder"),
         ("validate scene --html absent/page.html", "--html absent/page.html"),
         ("validate scene --fix file/new", "--fix file/new"),
         ("stats scene --out folder", "--out folder"),
@@ -76,6 +77,7 @@ def test_the_option_is_named(
         "stats scene --pages",
         "undistort scene",
         "validate scene --out",
+        "validate scene --sarif",
         "validate scene --html",
         "validate scene --fix",
     ],

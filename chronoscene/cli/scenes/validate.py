@@ -18,14 +18,14 @@ from chronoscene.kernels.runtime import keep_freed_memory
 from chronoscene.validation.folder.scene_folder import Track, no_progress
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.report.html import write_html
-from chronoscene.validation.report.json import write_json
+from chronoscene.validation.report.json import write_json, write_sarif
 from chronoscene.validation.report.rule_list import describe_rule
 from chronoscene.validation.report.text import write_text
 from chronoscene.validation.rule import SceneReport, is_valid
 from chronoscene.validation.rules import choose_rules
 from chronoscene.validation.run import ReadOptions, find_folders, lost_report, validate_scene
 
-WRITERS = {"text": write_text, "json": write_json, "html": write_html}
+WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
 
 NOT_VALID = 1  # Exit status when there are errors
 
@@ -48,6 +48,7 @@ def _explain(context: click.Context, option: click.Parameter, value: str | None)
     help="Output format.",
 )
 @OUT_FILE
+@click.option("--sarif", type=PATH, help="Also write a SARIF report to this file.")
 @click.option("--html", type=PATH, help="Also write an HTML page to this file.")
 @click.option(
     "--select",
@@ -85,6 +86,7 @@ def command(
     period_by: str | None,
     output_format: str,
     out: Path | None,
+    sarif: Path | None,
     html: Path | None,
     select: tuple[str, ...],
     ignore: tuple[str, ...],
@@ -104,7 +106,7 @@ def command(
     check = partial(_check, _codes(select), _codes(ignore), decode, read)
     choose_rules(_codes(select), _codes(ignore))  # errors in these options come first
     folders = find_folders(folder)
-    for option, file in (("--out", out), ("--html", html)):
+    for option, file in (("--out", out), ("--sarif", sarif), ("--html", html)):
         if file is not None:
             check_outside(file, folders, option=option)
         check_file(option, file)
@@ -119,8 +121,9 @@ def command(
         done = map_parallel(check, folders, lost=lost_report)
         reports = list(tracked(done, "check scenes", total=len(folders)))
     emit(WRITERS[output_format](reports, strict=strict), out)
-    if html is not None:
-        emit(write_html(reports, strict=strict), html, option="--html")
+    for option, file, write in (("--sarif", sarif, write_sarif), ("--html", html, write_html)):
+        if file is not None:
+            emit(write(reports, strict=strict), file, option=option)
     if not is_valid(reports, strict=strict):
         context.exit(NOT_VALID)
 

@@ -1,1 +1,1 @@
-"""Reports as text, JSON and HTML, and the page of all rules."""
+"""Reports as text, JSON, SARIF and HTML, and the page of all rules."""

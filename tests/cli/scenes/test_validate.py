@@ -84,15 +84,17 @@ def test_out(broken, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.json", "scene"]
 
 
-def test_a_page_beside_the_text(broken, tmp_path):
-    status, text = run(broken, "--html", tmp_path / "r.html")
+def test_reports_for_programs_and_people_beside_the_text(broken, tmp_path):
+    status, text = run(broken, "--sarif", tmp_path / "r.sarif", "--html", tmp_path / "r.html")
     assert status == 1 and text.startswith("scene: ")
+    assert json.loads((tmp_path / "r.sarif").read_text())["version"] == "2.1.0"
     assert "images/a0.png" in (tmp_path / "r.html").read_text()
 
 
-def test_a_page_instead_of_the_text(broken):
-    status, text = run(broken, "--format", "html")
-    assert status == 1 and text.startswith("<!doctype html>")
+@pytest.mark.parametrize(("form", "begin"), [("sarif", "{"), ("html", "<!doctype html>")])
+def test_other_formats(broken, form, begin):
+    status, text = run(broken, "--format", form)
+    assert status == 1 and text.startswith(begin)
 
 
 def test_out_has_no_colours(broken, tmp_path):
@@ -194,14 +196,14 @@ def test_explain_nothing_that_is_there(capsys, monkeypatch):
     assert "--explain: expected rule codes" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--out", "--html"])
+@pytest.mark.parametrize("option", ["--out", "--sarif", "--html"])
 def test_reports_are_not_written_into_a_scene(broken, option, monkeypatch):
     with pytest.raises(ConfigError, match=f"{option} .*: expected a place outside the scene"):
         run(broken, option, broken / "report")
     assert not (broken / "report").exists()
 
 
-@pytest.mark.parametrize("option", ["--out", "--html"])
+@pytest.mark.parametrize("option", ["--out", "--sarif", "--html"])
 def test_places_of_reports_are_tried_first(broken, option, tmp_path, monkeypatch):
     monkeypatch.setattr("chronoscene.cli.scenes.validate.validate_scene", lambda *_, **__: 1 / 0)
     with pytest.raises(ConfigError, match=f"{option} .*found Is a directory"):
