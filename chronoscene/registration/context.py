@@ -45,6 +45,10 @@ class Options:
     """None for one per processor. With 1, every run gives bit-identical results."""
     seed: int = 0
     """Seed of the draw of held-out tracks."""
+    features: str | None = None
+    """File of features, or an installed extractor, instead of SIFT."""
+    matches: str | None = None
+    """File of matches between these features, or an installed matcher."""
     tie_points: Path | None = None
     """File of tie points or ground control."""
     tie_scale: float = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,7 @@ def run(
         inputs = gather(captures, into, context)
         matched = find_matches(inputs, context)
         registered, ties = _tie(estimate(inputs, matched, context), points, crs, inputs, context)
+        registered = replace(registered, features=matched.made_by)
         staged = _stage_scene(registered, inputs, out.resolve().name, context)
         if ties is not None and ties.replaced:
             points = None  # they are points of the model already

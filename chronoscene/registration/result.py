@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference
+from chronoscene.registration.features import METHOD
 from chronoscene.scene import Camera
 
 Route = Literal["joint", "frozen", "separate"]
@@ -103,6 +104,8 @@ class Registered:
     """Folder of the images: photos as ``cameras`` describe them."""
     unplaced: frozenset[str] = frozenset()
     """Images of periods that are in a frame of their own, to be placed by tie points."""
+    features: str = METHOD
+    """Name of the features and matches."""
 
     @property
     def unit(self) -> str:

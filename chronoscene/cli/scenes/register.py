@@ -90,6 +90,16 @@ FAILED = 1  # Exit status if a verdict is fail
     help="With 1, every run gives bit-identical results.  [default: one per processor]",
 )
 @click.option(
+    "--features",
+    help="Features in place of SIFT: features.h5 of hloc, a database of COLMAP, or an installed "
+    "extractor.",
+)
+@click.option(
+    "--matches",
+    help="Matches of these features: matches.h5 of hloc, a database of COLMAP, or an installed "
+    "matcher.  [default: those of a database, else mutual nearest neighbours]",
+)
+@click.option(
     "--tie-points",
     type=EXISTING_FILE,
     help="CSV of point, image, x, y and optional world coordinates X, Y, Z and role (control or "

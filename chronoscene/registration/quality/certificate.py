@@ -103,6 +103,8 @@ class Certificate:
     """All measurements of a registration."""
 
     route: str
+    features: str
+    """Name of the features and matches that it was made with."""
     unit: str
     """``metre``, or ``unknown``: then distances mean something as shares of the extent only."""
     extent: float
@@ -128,6 +130,7 @@ def certify(model: Registered) -> Certificate:
     focals = [np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in model.cameras]
     return Certificate(
         route=model.route,
+        features=model.features,
         unit=model.unit,
         extent=extent,
         focal=float(np.median(focals)) if focals else float("nan"),

@@ -122,6 +122,7 @@ def _run_route(route: Route, inputs: PhotoInputs, matched: Matched, context: Con
     registered = _assemble(route, route, result, inputs, context)
     missing = set(inputs.periods) - set(registered.names)
     lost = reasons(missing, matched.keypoints, matched.partners, result["left"])
+    lost |= dict.fromkeys(missing & matched.absent, "not in the file of features")
     registered = replace(registered, unplaced=frozenset(result["unplaced"]))
     return _with_lost(registered, lost, inputs)
 

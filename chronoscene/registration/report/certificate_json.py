@@ -183,6 +183,7 @@ def to_json(
                 "ground_pixel": position.ground_pixel,
             },
             "route": certificate.route,
+            "features": certificate.features,
             "unit": certificate.unit,
             "extent": certificate.extent,
             "focal_px": certificate.focal,
