@@ -37,6 +37,8 @@ class Options:
     """Number of photos up to which all pairs are matched."""
     held_out: float = 0.1
     """Share of the tracks across periods that take no part in the estimation."""
+    cameras: Path | None = None
+    """File of known calibrations; see `photos.known_cameras`."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP's camera model for the photos."""
     calibration: Calibration = "auto"

@@ -19,6 +19,7 @@ from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import PhotoInputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.extension import add_period
+from chronoscene.registration.reconstruct.known_control import check_options, resect_photos
 from chronoscene.registration.report.coordinates import write_coordinates
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
@@ -66,6 +67,7 @@ def run(
             found="--into, which does not move existing poses",
             todo="omit one of the two",
         )
+    check_options(options)
     output.check_free(out, overwrite=options.overwrite)
     work = options.work_folder(out)
     crs = _output_system(options.crs)
@@ -78,10 +80,16 @@ def run(
         context = Context(work, Stages(work), options, report, lock)
         inputs = gather(captures, into, context)
         matched = find_matches(inputs, context)
-        registered, ties = _tie(estimate(inputs, matched, context), points, crs, inputs, context)
+        ties: TieAlignment | None
+        if options.route == "resection" and points is not None:
+            registered, ties = resect_photos(inputs, matched, points, crs, context)
+            context.stages.remark("tie points", *ties.remarks)
+        else:
+            found_model = estimate(inputs, matched, context)
+            registered, ties = _tie(found_model, points, crs, inputs, context)
         registered = replace(registered, features=matched.made_by)
         staged = _stage_scene(registered, inputs, out.resolve().name, context)
-        if ties is not None and ties.replaced:
+        if ties is not None and (ties.replaced or ties.controlled):
             points = None  # they are points of the model already
         found = inspect_registration(
             registered,

@@ -37,8 +37,9 @@ FAILED = 1  # Exit status if a verdict is fail
 @click.option(
     "--route",
     type=click.Choice([r for r in ROUTES if r != "frozen"]),
-    help="joint: all photos in one reconstruction; separate: one for each period, then aligned.  "
-    "[default: joint if matches connect all periods]",
+    help="joint: all photos in one reconstruction; separate: one for each period, then aligned; "
+    "resection: known cameras placed by control points, for few photos.  [default: joint if "
+    "matches connect all periods]",
 )
 @click.option(
     "--work",
@@ -70,6 +71,12 @@ FAILED = 1  # Exit status if a verdict is fail
     type=click.FloatRange(0, 0.5),
     default=DEFAULTS.held_out,
     help="Share of the tracks across periods that are used only to test the result.",
+)
+@click.option(
+    "--cameras",
+    type=EXISTING_FILE,
+    help="Known calibrations: lines of a pattern of photo names, then model, width, height and "
+    "parameters as in COLMAP's cameras.txt. --route resection keeps them, others refine them.",
 )
 @click.option(
     "--camera-model",

@@ -11,6 +11,7 @@ from chronoscene.registration.features import METHOD
 from chronoscene.registration.features.camera_groups import camera_groups, scene_groups
 from chronoscene.registration.features.given.source import describe, find_sources
 from chronoscene.registration.photos.inputs import PhotoInputs
+from chronoscene.registration.photos.known_cameras import known_groups
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +49,10 @@ def find_matches(inputs: PhotoInputs, context: Context) -> Matched:
 
 def _features(inputs: PhotoInputs, context: Context, given: Mapping[str, Any]) -> dict[str, Any]:
     options = context.options
-    groups = camera_groups(inputs.images, options.camera_model, options.calibration)
+    if options.cameras is not None:
+        groups = known_groups(options.cameras, inputs.images)
+    else:
+        groups = camera_groups(inputs.images, options.camera_model, options.calibration)
     if inputs.scene is not None:
         groups = scene_groups(inputs.scene) + groups
     return extract_features(groups, context, given)

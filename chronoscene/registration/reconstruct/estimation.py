@@ -138,6 +138,17 @@ def refined(
     return _with_lost(again, dict(registered.unregistered) | dict.fromkeys(lost, reason), inputs)
 
 
+def resected(
+    arguments: Mapping[str, Any], inputs: PhotoInputs, matched: Matched, context: Context
+) -> tuple[Registered, dict[str, Any]]:
+    """The model that the task ``resection`` makes, and its result."""
+    result = _estimate("resection", "resection", dict(arguments), context)
+    registered = _assemble("resection", "resection", result, inputs, context)
+    reason = "fewer than three clicked control points, or several poses that fit them"
+    lost = dict.fromkeys(set(inputs.periods) - set(registered.names), reason)
+    return _with_lost(registered, lost, inputs), result
+
+
 def _estimate(task: str, name: str, settings: dict[str, Any], context: Context) -> dict[str, Any]:
     """Run a task that estimates, once; stages after it do not depend on it."""
 

@@ -22,6 +22,7 @@ from chronoscene.registration.reconstruct.consistency import (
     deregister_misplaced,
     pair_agreements,
 )
+from chronoscene.registration.reconstruct.control_adjustment import adjust_with_control, drop_bad
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
 from chronoscene.registration.reconstruct.mapping import (
     Task,
@@ -212,8 +213,8 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Triangulate at given poses, add tie points, adjust, and write the model.
 
     Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (parameters by
-    name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``out``, ``scratch``,
-    ``threads``.
+    name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``control`` (see
+    `control_adjustment.adjust_with_control`), ``out``, ``scratch``, ``threads``.
     """
     task = Task.start(arguments, report)
     model = known_images(task.database)
@@ -224,8 +225,13 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         report("adjusting", i, 2)
         model = triangulate(model, task, "")
         _add_ties(model, arguments["ties"])
-        adjust(model, threads=task.threads)
-    task.remarks.append(f"adjusted with {len(arguments['ties'])} tie points")
+        if arguments["control"]:
+            adjust_with_control(model, arguments["control"], threads=task.threads)
+            drop_bad(model)
+        else:
+            adjust(model, threads=task.threads)
+    counts = f"{len(arguments['ties'])} tie points and {len(arguments['control'])} control points"
+    task.remarks.append(f"adjusted with {counts}")
     return task.finish(model)
 
 

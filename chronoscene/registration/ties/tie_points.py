@@ -4,8 +4,8 @@ Two forms are read. A CSV has a row for each click: point id, image, x, y, and f
 also their world coordinates, their role (control, or check) and the accuracy of the coordinates;
 a row may lack the click where a point was surveyed, but is seen in no photo. OpenDroneMap's
 ``gcp_list.txt`` has a line with the projection, then ``geo_x geo_y geo_z im_x im_y image_name
-[gcp_name]`` for each click; check points have names that start with ``CHK-``. Pixels are those of the
-photo as stored, without its orientation tag applied; the corner of the image is (0, 0).
+[gcp_name]`` for each click; check points have names that start with ``CHK-``. Pixels are those of
+the photo as stored, without its orientation tag applied; the corner of the image is (0, 0).
 """
 
 from __future__ import annotations
@@ -91,6 +91,10 @@ class TiePoints:
     def names(self, role: Role) -> set[str]:
         """Names of the points of a role."""
         return {p.name for p in self.points if p.role == role}
+
+    def sigmas(self) -> dict[str, Array]:
+        """Stated standard deviations, metres east, north and up. Name -> [3]"""
+        return {p.name: np.array(p.sigma) for p in self.points if p.sigma is not None}
 
     def located(self, frame: Georeference | None) -> dict[str, Array]:
         """Surveyed coordinates in a local frame; none if there is no frame. Name -> [3]

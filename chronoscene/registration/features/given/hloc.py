@@ -2,8 +2,8 @@
 
 A photo is a group, whose name may have slashes, with ``keypoints`` [K, 2], ``descriptors`` [D, K]
 and ``image_size``; the centre of the first pixel is (0, 0). A pair is a group ``a/b``, in older
-files ``a_b``, of names with ``-`` for slashes, with ``matches0``: for each keypoint of ``a`` that of
-``b``, or -1. Links to other places and files are not followed.
+files ``a_b``, of names with ``-`` for slashes, with ``matches0``: for each keypoint of ``a`` that
+of ``b``, or -1. Links to other places and files are not followed.
 """
 
 from __future__ import annotations

@@ -81,9 +81,8 @@ def test_a_changed_file_runs_again_what_depends_on_it(
         "matches",
     ]
     with h5py.File(files[1], "r+") as file:
-        pair = next(iter(file["2016-p0_000.jpg"])) if "2016-p0_000.jpg" in file else None
         group = file[next(iter(file))]
-        rows = group[pair or next(iter(group))]["matches0"]
+        rows = group[next(iter(group))]["matches0"]
         removed = int((rows[()] != -1).sum())
         rows[:] = -1
     before = sum(map(len, stored(tmp_path / "work")[1].values()))
@@ -153,7 +152,7 @@ def test_names_fit_by_their_end() -> None:
     photos = ["2016/a.jpg", "2016/b.tif.png", "2023/c_d.jpg"]
     found = match_names("f", photos, ["images/2016/a.jpg", "b.tif", "2023/c d.jpg", "z.jpg"])
     assert found == dict(zip(photos, ["images/2016/a.jpg", "b.tif", "2023/c d.jpg"], strict=True))
-    with pytest.raises(RegistrationError, match="fits 2016/a.jpg and 2023/a.jpg"):
+    with pytest.raises(RegistrationError, match=r"fits 2016/a\.jpg and 2023/a\.jpg"):
         match_names("f", ["2016/a.jpg", "2023/a.jpg"], ["a.jpg"])
     with pytest.raises(RegistrationError, match="found none of them"):
         match_names("f", photos, ["q.jpg"])
