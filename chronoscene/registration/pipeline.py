@@ -9,7 +9,7 @@ from typing import Any
 
 from chronoscene.colmap.model import copy_poses
 from chronoscene.errors import ConfigError
-from chronoscene.geodesy import ReferenceSystem, read_reference_system
+from chronoscene.geodesy import ReferenceSystem, read_projected
 from chronoscene.io.processes import Report
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
@@ -20,7 +20,7 @@ from chronoscene.registration.photos.inputs import PhotoInputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.extension import add_period
 from chronoscene.registration.reconstruct.known_control import check_options, resect_photos
-from chronoscene.registration.report.coordinates import write_coordinates
+from chronoscene.registration.report.coordinates import placed_model, write_coordinates
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
 from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
@@ -70,7 +70,7 @@ def run(
     check_options(options)
     output.check_free(out, overwrite=options.overwrite)
     work = options.work_folder(out)
-    crs = _output_system(options.crs)
+    crs = None if options.crs is None else read_projected("--crs", options.crs)
     points = None
     if options.tie_points is not None:
         points = read_tie_points(options.tie_points, scale=options.tie_scale, crs=crs)
@@ -101,28 +101,13 @@ def run(
         )
         for name, judged in (("alignment", found.verdict), ("absolute position", found.position)):
             context.stages.remark(name, f"{judged.level}: {judged.text}")
-        write_coordinates(staged, registered, crs)
+        write_coordinates(staged, placed_model(registered), registered.georeference, crs)
         output.write_log(staged, _log(registered, inputs, context))
         output.check_free(out, overwrite=options.overwrite)
         output.publish(staged, out)
     if inspected is not None:
         inspected(found)
     return registered
-
-
-def _output_system(text: str | None) -> ReferenceSystem | None:
-    """Parse the reference system of the output; it must be projected."""
-    if text is None:
-        return None
-    crs = read_reference_system("--crs", text, error=ConfigError)
-    if not crs.is_projected:
-        raise ConfigError(
-            "--crs",
-            expected="a projected reference system in metres, such as EPSG:32632",
-            found=f"{text!r}, which is in degrees",
-            todo="choose the UTM zone of the place, for example",
-        )
-    return crs
 
 
 def _tie(

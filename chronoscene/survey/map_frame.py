@@ -144,11 +144,11 @@ def _conversion(
 
 def _projected(place: str, text: str) -> ReferenceSystem:
     system = read_reference_system(place, text, error=ConfigError)
-    if not system.is_projected:
+    if not system.is_projected or system.unit != 1:
         raise ConfigError(
             f"{place} {text}",
             expected="a projected reference system in metres, such as EPSG:32632",
-            found="one in degrees",
+            found="one in feet" if system.is_projected else "one in degrees",
             todo="choose a projected one with --crs",
         )
     return system

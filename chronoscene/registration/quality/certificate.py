@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from chronoscene.arrays import Array, Mask
+from chronoscene.registration.features import METHOD
 from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
@@ -103,8 +104,6 @@ class Certificate:
     """All measurements of a registration."""
 
     route: str
-    features: str
-    """Name of the features and matches that it was made with."""
     unit: str
     """``metre``, or ``unknown``: then distances mean something as shares of the extent only."""
     extent: float
@@ -117,6 +116,8 @@ class Certificate:
     """All pairs of periods, earlier first."""
     evidence: Evidence
     """Observations on which the figures are measured."""
+    features: str = METHOD
+    """Name of the features and matches that it was made with."""
 
 
 def certify(model: Registered) -> Certificate:

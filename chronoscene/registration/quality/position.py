@@ -96,12 +96,12 @@ class Position:
     """Points that took no part in the estimation."""
     control: Rmse | None
     """Points that the model was moved to: optimistic."""
-    left_out: Rmse | None
-    """Control points, each placed by an adjustment to which its coordinates are unknown."""
     gps: Rmse | None
     """Cameras against their GPS positions."""
     ground_pixel: float | None
     """Metres that a pixel covers, median over the surveyed points."""
+    left_out: Rmse | None = None
+    """Control points, each placed by an adjustment to which its coordinates are unknown."""
 
     @property
     def todo(self) -> tuple[str, ...]:
@@ -149,13 +149,13 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if points and gps is not None:
         gap = float(np.linalg.norm(np.median(_gps_errors(model)[1][:, :2], axis=0)))
         objections += check(POSITION_THRESHOLDS["gps"], gap, "ground control and GPS", "gps")
-    objections += _unproven(found or left_out, control, gps)
+    objections += _unproven(found or (left_out if _is_proof(model, pixel) else None), control, gps)
     objections.sort(key=lambda f: f.level != "fail")
     level: Level | Literal["not checked"] = worst_level(f.level for f in objections)
     if found is None and control is None and gps is None:
         level = "not checked"
     text = _words(level, objections, found, left_out, ties) + _precision(model)
-    return Position(level, text, tuple(objections), found, control, left_out, gps, pixel)
+    return Position(level, text, tuple(objections), found, control, gps, pixel, left_out)
 
 
 def _errors_left_out(model: Registered) -> dict[str, tuple[Array, Array]]:
@@ -177,6 +177,17 @@ def _contradicted(model: Registered) -> Iterator[Objection]:
         note = f" ({distance:.3g} m, of which the others leave {left:.2g} m open)"
         place = f"control point {name}"
         yield from check(POSITION_THRESHOLDS["left_out"], ratio, place, "left_out", note)
+
+
+def _is_proof(model: Registered, pixel: float | None) -> bool:
+    """Return True if every point is determined by the others to the precision of the verdict."""
+    if model.resection is None or pixel is None:
+        return False
+    limit = pixel * (POSITION_THRESHOLDS["horizontal"].fail or 0.0)
+    found = _errors_left_out(model)
+    return len(found) == len(model.resection.left_out) and all(
+        np.linalg.norm(spread) <= limit for _, spread in found.values()
+    )
 
 
 def _precision(model: Registered) -> str:

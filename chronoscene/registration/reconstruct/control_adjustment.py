@@ -15,6 +15,7 @@ import numpy as np
 
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.reconstruct.mapping import (
+    FUNCTION_TOLERANCE,
     LOSS_PIXELS,
     MAX_ITERATIONS,
     MAX_REPROJECTION_ERROR,
@@ -65,6 +66,7 @@ def adjust_with_control(
     options.ceres.loss_function_scale = LOSS_PIXELS
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.max_num_iterations = 2 * MAX_ITERATIONS
+    options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, work)
     adjuster.solve()
     for image_id in model.reg_image_ids():

@@ -113,7 +113,9 @@ def align_with_tie_points(
             return xyz
         return output.from_local(there.georeference, xyz)
 
-    found = tuple(with_errors(residuals(there, every), tie_points, known, used, convert))
+    unit = 1.0 if output is None or there.georeference is None else output.unit
+
+    found = tuple(with_errors(residuals(there, every), tie_points, known, used, convert, unit))
     named = [r.name for r in found if r.outlier]
     remarks += more + ([f"outliers: {', '.join(named)}"] if named else [])
     return TieAlignment(
