@@ -79,7 +79,7 @@ def test_systems_that_would_be_converted_wrongly_are_refused(text: str, found: s
 
 
 def test_coordinates_in_feet_have_heights_in_feet() -> None:
-    metres, feet = read_reference_system("", "EPSG:26945"), read_reference_system("", "EPSG:2229")
+    metres, feet = read_reference_system("", "EPSG:6423"), read_reference_system("", "EPSG:6424")
     frame = Georeference(34.0, -118.0, 50.0, "as stated")
     enu = np.array([[10.0, 20.0, 30.0], [-5.0, 0.0, 7.0]])
     foot = 1200 / 3937

@@ -213,7 +213,7 @@ def inspect_registration(
     model = model if tie_points is None else with_tie_tracks(model, tie_points)
     certificate = certify(model)
     verdict, position = judge(certificate), judge_position(model, ties)
-    data = to_json(model, certificate, verdict, position, ties)
+    data = to_json(certificate, verdict, position, ties)
     write_text_atomic(folder / CERTIFICATE, json.dumps(data, indent=1, allow_nan=False) + "\n")
     if ties is not None and any(r.role != "tie" for r in ties.residuals):
         write_control(folder / CONTROL, ties.residuals)

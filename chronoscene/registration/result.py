@@ -60,7 +60,7 @@ class HeldOutTracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resection:
-    """How well poses are known that surveyed points fix, by two measures."""
+    """Precision of poses that surveyed points fix, by two measures."""
 
     deviations: Mapping[str, tuple[list[float], list[float]]]
     """Standard deviations by photo, from the adjustment: of its centre in world units, and of its
@@ -119,7 +119,7 @@ class Registered:
     features: str = METHOD
     """Name of the features and matches."""
     resection: Resection | None = None
-    """How well poses are known that surveyed points fix."""
+    """Precision of poses that surveyed points fix."""
 
     @property
     def unit(self) -> str:

@@ -34,7 +34,7 @@ from chronoscene.registration.quality.rays import (
     sampson_distance,
 )
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
-from chronoscene.registration.result import Registered
+from chronoscene.registration.result import Registered, Resection
 from chronoscene.scene.geometry import camera_centre
 
 BADLY_PLACED = 4.0  # Pixels; transfers whose point is less certain than this are ignored
@@ -118,6 +118,8 @@ class Certificate:
     """Observations on which the figures are measured."""
     features: str = METHOD
     """Name of the features and matches that it was made with."""
+    resection: Resection | None = None
+    """Precision of poses that surveyed points fix."""
 
 
 def certify(model: Registered) -> Certificate:
@@ -132,6 +134,7 @@ def certify(model: Registered) -> Certificate:
     return Certificate(
         route=model.route,
         features=model.features,
+        resection=model.resection,
         unit=model.unit,
         extent=extent,
         focal=float(np.median(focals)) if focals else float("nan"),

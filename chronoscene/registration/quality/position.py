@@ -149,7 +149,10 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if points and gps is not None:
         gap = float(np.linalg.norm(np.median(_gps_errors(model)[1][:, :2], axis=0)))
         objections += check(POSITION_THRESHOLDS["gps"], gap, "ground control and GPS", "gps")
-    objections += _unproven(found or (left_out if _is_proof(model, pixel) else None), control, gps)
+    if model.resection is None or found is not None:
+        objections += _unproven(found, control, gps)
+    else:
+        objections += _open(model, pixel)
     objections.sort(key=lambda f: f.level != "fail")
     level: Level | Literal["not checked"] = worst_level(f.level for f in objections)
     if found is None and control is None and gps is None:
@@ -179,15 +182,22 @@ def _contradicted(model: Registered) -> Iterator[Objection]:
         yield from check(POSITION_THRESHOLDS["left_out"], ratio, place, "left_out", note)
 
 
-def _is_proof(model: Registered, pixel: float | None) -> bool:
-    """Return True if every point is determined by the others to the precision of the verdict."""
-    if model.resection is None or pixel is None:
-        return False
-    limit = pixel * (POSITION_THRESHOLDS["horizontal"].fail or 0.0)
-    found = _errors_left_out(model)
-    return len(found) == len(model.resection.left_out) and all(
-        np.linalg.norm(spread) <= limit for _, spread in found.values()
-    )
+def _open(model: Registered, pixel: float | None) -> Iterator[Objection]:
+    """An objection where the other points fix one only roughly, so that it proves nothing."""
+    limit = (pixel or 0.0) * (POSITION_THRESHOLDS["horizontal"].fail or 0.0)
+    errors = _errors_left_out(model)
+    spread = {name: float(np.linalg.norm(errors[name][1])) for name in errors}
+    for name in model.resection.left_out if model.resection is not None else ():
+        spread.setdefault(name, float("inf"))
+    worst = max(spread, key=lambda name: spread[name], default="")
+    if spread and spread[worst] > limit:
+        how = f"{spread[worst]:.2g} m" if errors.get(worst) is not None else "any distance"
+        yield Objection(
+            "doubtful", "independent", "control points",
+            f"the others leave {how} of {worst} open, where its coordinates are unknown",
+            "a point that the others do not fix cannot confirm them",
+            "mark more control points, spread over the photos, or set some aside as check points",
+        )  # fmt: skip
 
 
 def _precision(model: Registered) -> str:

@@ -25,7 +25,6 @@ from chronoscene.registration.quality.misalignment import Interval, Misalignment
 from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position, Rmse
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
 from chronoscene.registration.quality.verdict import THRESHOLDS, Verdict
-from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 
 FORMAT = "chronoscene-registration-2"
@@ -168,11 +167,7 @@ def _interval(name: str, size: Interval, unit: str, over: str, *, factor: float 
 
 
 def to_json(
-    model: Registered,
-    certificate: Certificate,
-    verdict: Verdict,
-    position: Position,
-    ties: TieAlignment | None = None,
+    certificate: Certificate, verdict: Verdict, position: Position, ties: TieAlignment | None = None
 ) -> dict[str, Any]:
     """Content of ``registration.json``: plain data, finite numbers or null."""
     return _plain(
@@ -222,7 +217,7 @@ def to_json(
                 "remarks": ties.remarks,
                 "points": [asdict(r) for r in ties.residuals],
             },
-            "resection": None if model.resection is None else asdict(model.resection),
+            "resection": None if certificate.resection is None else asdict(certificate.resection),
             "thresholds": [{"key": key} | asdict(t) for key, t in THRESHOLDS.items()],
             "position_thresholds": [
                 {"key": key} | asdict(t) for key, t in POSITION_THRESHOLDS.items()

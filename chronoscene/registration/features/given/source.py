@@ -1,4 +1,4 @@
-"""Where given features and matches come from, and which photo a name in them means."""
+"""Sources of given features and matches, and the photos that names in them mean."""
 
 from __future__ import annotations
 
