@@ -28,7 +28,7 @@ def read_cameras(path: Path) -> list[tuple[str, Camera]]:
     Raises:
         SceneError: If a line is wrong; the message names it.
     """
-    found = []
+    found: list[tuple[str, Camera]] = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue

@@ -31,6 +31,7 @@ MAX_TRIPLES = 100  # Of control points, by which a photo is placed
 GROSS_PIXELS = 20.0  # A click that is further off does not count
 MAX_TRACKS = 2000  # Of features, that tie the photos
 SAME = 1e-3  # Difference of the rotation matrices of two poses that count as one
+MIN_AGREEMENT = 0.5  # Share of the matches that must agree with one of several poses
 MAX_LEFT_OUT = 20  # Control points that are left out one at a time
 
 
@@ -103,7 +104,8 @@ def _place_all(
         if not poses:
             task.remarks.append(f"{name}: not placed; three clicked control points are needed")
             continue
-        chosen, why = poses[0], ""
+        chosen: Array | None = poses[0]
+        why = ""
         if len(poses) > 1:
             chosen, why = _choose(model, image_id, poses, matches)
         if chosen is None:
@@ -173,6 +175,8 @@ def _choose(
         scores.append((round(-agreeing / sum(map(len, joined.values())), 1), float(distance)))
         model.deregister_frame(model.images[image_id].frame_id)
     best = min(range(len(poses)), key=lambda i: scores[i])
+    if -scores[best][0] < MIN_AGREEMENT:
+        return None, ""
     return poses[best], (
         f"three points allow {len(poses)} poses; {-scores[best][0]:.0%} of the matches with "
         f"{len(partners)} placed photos agree with the one chosen"
@@ -219,7 +223,8 @@ def _rays(model: pycolmap.Reconstruction, clicks: Sequence[Any]) -> Iterator[tup
     ids = {str(image.name): i for i, image in model.images.items()}
     for name, x, y in clicks:
         image = model.images[ids[name]]
-        ray = model.cameras[image.camera_id].cam_from_img(np.array([[x, y]], np.float64))[0]
+        camera = model.cameras[image.camera_id]
+        (ray,) = np.asarray(camera.cam_from_img(np.array([[x, y]], np.float64)))
         pose = image_pose(image)
         direction = pose[:3, :3].T @ np.append(ray, 1)
         yield -pose[:3, :3].T @ pose[:3, 3], direction / np.linalg.norm(direction)

@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -101,7 +102,7 @@ class ColmapDatabase:
             raise wrong(place, f"{size} bytes", "another number of them")
         return np.frombuffer(data, dtype).reshape(rows, columns).copy()
 
-    def _rows(self, query: str, *values: int) -> list[tuple]:  # type: ignore[type-arg]
+    def _rows(self, query: str, *values: int) -> list[tuple[Any, ...]]:
         try:
             uri = f"file:{quote(str(self.path.resolve()))}?mode=ro&immutable=1"
             with closing(sqlite3.connect(uri, uri=True)) as opened:

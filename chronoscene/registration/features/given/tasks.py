@@ -82,7 +82,7 @@ def import_matches(arguments: Mapping[str, Any], report: Report) -> dict[str, An
     Returns:
         As `pairs.choose_pairs`.
     """
-    source = Source(**matches_of(arguments["given"]))
+    source = Source(**(matches_of(arguments["given"]) or {}))
     periods = {image["name"]: image["period"] for image in arguments["images"]}
     pairs = []
     with pycolmap.Database.open(arguments["database"]) as opened:
