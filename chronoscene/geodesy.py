@@ -134,18 +134,18 @@ def read_reference_system(
     return ReferenceSystem(text, bool(crs.is_projected), unit)
 
 
-def read_projected(place: str, text: str) -> ReferenceSystem:
-    """Parse the reference system of an output, which must be projected.
+def read_projected(place: str, text: str, *, metres: bool = False) -> ReferenceSystem:
+    """Parse the reference system of an output, which must be projected, and in metres if asked.
 
     Raises:
         ConfigError: If it is not, or as `read_reference_system`.
     """
     system = read_reference_system(place, text, error=ConfigError)
-    if not system.is_projected:
+    if not system.is_projected or (metres and system.unit != 1):
         raise ConfigError(
-            place,
-            expected="a projected reference system, such as EPSG:32632",
-            found=f"{text!r}, which is in degrees",
+            f"{place} {text}",
+            expected=f"a projected reference system{' in metres' * metres}, such as EPSG:32632",
+            found="one in feet" if system.is_projected else "one in degrees",
             todo="choose the UTM zone of the place, for example",
         )
     return system

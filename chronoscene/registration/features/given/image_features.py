@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ MAX_KEYPOINTS = 1_000_000  # Of a photo; more are a damaged or hostile file
 MAX_DIMENSION = 4096  # Of descriptors
 MAX_VALUES = 2**28  # Numbers in the descriptors of a photo
 MAX_RATIO = 0.8  # Of the distances to the nearest descriptor and to the second nearest
+CHUNK = 1024  # Keypoints that are compared with those of another photo at a time
 BORDER = 2.0  # Pixels by which a keypoint may lie outside of its photo
 
 
@@ -28,13 +28,6 @@ class ImageFeatures:
     """Bytes are SIFT in COLMAP's form. [K, D]"""
     size: tuple[int, int] | None
     """Width and height of the photo, if known."""
-
-
-class MatcherPlugin(Protocol):
-    """Matcher of an entry point ``chronoscene.matchers``; called by several threads."""
-
-    def __call__(self, first: ImageFeatures, second: ImageFeatures) -> NDArray[np.uint32]:
-        """Match two photos; indices. [M, 2]"""
 
 
 def checked(place: str, found: ImageFeatures, size: tuple[int, int]) -> ImageFeatures:
@@ -98,9 +91,16 @@ def nearest(first: ImageFeatures, second: ImageFeatures) -> NDArray[np.uint32]:
         d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12)
         for d in (first.descriptors.astype(np.float32), second.descriptors.astype(np.float32))
     )
-    similarity = a @ b.T
-    best, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    least, next_least = 1 - np.sort(np.partition(similarity, -2, axis=1)[:, -2:], axis=1).T[::-1]
-    clear = least < MAX_RATIO**2 * next_least  # of squared distances
-    rows = np.flatnonzero(clear & (back[best] == np.arange(len(best))))
-    return np.column_stack([rows, best[rows]]).astype(np.uint32)
+    best, back = np.zeros(len(a), np.int64), np.zeros(len(b), np.int64)
+    clear, most = np.zeros(len(a), bool), np.full(len(b), -np.inf, np.float32)
+    for start in range(0, len(a), CHUNK):
+        rows = slice(start, start + CHUNK)
+        similarity = a[rows] @ b.T
+        best[rows] = similarity.argmax(axis=1)
+        second_most, first_most = np.sort(np.partition(similarity, -2, axis=1)[:, -2:], axis=1).T
+        clear[rows] = 1 - first_most < MAX_RATIO**2 * (1 - second_most)  # squared distances
+        nearer = similarity.max(axis=0) > most
+        back[nearer] = start + similarity.argmax(axis=0)[nearer]
+        most = np.maximum(most, similarity.max(axis=0))
+    mutual = np.flatnonzero(clear & (back[best] == np.arange(len(best))))
+    return np.column_stack([mutual, best[mutual]]).astype(np.uint32)
