@@ -16,6 +16,7 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.registration.quality.verdict import Level, Objection, Threshold, check, worst_level
 from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.control import CONTRADICTION
 from chronoscene.registration.ties.residuals import PointResidual
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 from chronoscene.scene.geometry import camera_centre
@@ -25,6 +26,8 @@ _COMPARE = (
     "errors (control.csv)"
 )
 _CHECK = "set some surveyed points aside as check points: role check in the file of --tie-points"
+
+_MOST_AGREE = "the other control points agree with each other, but not with it"
 
 POSITION_THRESHOLDS: dict[str, Threshold] = {
     "horizontal": Threshold(
@@ -144,6 +147,11 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     objections += _rejected(
         [r for r in points if r.role == "control" and controlled and not r.used]
     )
+    objections += [
+        Objection("doubtful", "contradiction", "control points", remark, _MOST_AGREE, _COMPARE)
+        for remark in (ties.remarks if ties is not None else ())
+        if remark.startswith(CONTRADICTION)
+    ]
     if found is not None:
         objections += check(POSITION_THRESHOLDS["points"], found.count, "check points", "points")
     if points and gps is not None:
@@ -264,7 +272,7 @@ def _rejected(points: Sequence[PointResidual]) -> Iterator[Objection]:
         found = f"{np.linalg.norm(r.error or 0.0):.3g} m off, so it was left out"
         yield Objection(
             "doubtful", "outlier", f"control point {r.name}", found,
-            "the other control points agree with each other, but not with it", _COMPARE,
+            _MOST_AGREE, _COMPARE,
         )  # fmt: skip
 
 

@@ -97,7 +97,7 @@ def _photo(capture: Capture, image: PosedImage | None, max_size: int) -> dict[st
 
 
 def _points(points: TiePoints, names: Sequence[str]) -> list[dict[str, Any]]:
-    index = match_images(points, names) if any(p.clicks for p in points.points) else {}
+    index = match_images(points, names)
     return [
         {
             "name": p.name,

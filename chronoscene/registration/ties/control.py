@@ -19,6 +19,9 @@ LIMIT = 3.0  # Standard deviations within which coordinates agree with a model
 AGREEING = 5.0
 """Factor by which a point must spoil the fit of the others to be named as contradicting them."""
 
+CONTRADICTION = "control contradicts itself: "
+"""Start of the remarks on points that `contradictions` names."""
+
 LEAST_SIGMA = 0.02
 """World units: control without a stated accuracy is not taken to be better than this."""
 

@@ -20,6 +20,7 @@ from chronoscene.geodesy import Georeference, ReferenceSystem
 from chronoscene.registration.quality.rays import model_rays, place
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.control import (
+    CONTRADICTION,
     contradictions,
     control_arguments,
     fit_control,
@@ -214,7 +215,7 @@ def _to_control(
     source = placed.xyz[[i for i, _ in known]].reshape(-1, 3)
     target = np.array([control[name] for _, name in known]).reshape(-1, 3)
     names, sigma = [name for _, name in known], points.sigmas()
-    against = [f"control contradicts itself: {c}" for c in contradictions(names, source, target)]
+    against = [CONTRADICTION + c for c in contradictions(names, source, target)]
     found = fit_control(source, target, [sigma.get(name) for name in names])
     if found is None:
         remark = (

@@ -339,8 +339,8 @@ def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int |
                 "write the name with its folder",
             )  # fmt: skip
         found[click.image] = index.get(plain, index[ends[0]] if ends else None)
-    if all(i is None for i in found.values()):
-        first = next((c for p in tie_points.points for c in p.clicks), Click("no click", 0, 0, 1))
+    if found and all(i is None for i in found.values()):
+        first = next(c for p in tie_points.points for c in p.clicks)
         raise _wrong(
             tie_points.path, first.line, "images that are registered, such as "
             f"{names[0] if names else '(there are none)'}", first.image, "correct the names",

@@ -130,6 +130,16 @@ def test_a_wrong_control_point_is_named_and_left_out(tmp_path: Path, made: Gener
     assert position.control is not None and position.control.horizontal < 0.2
 
 
+def test_a_wrong_one_of_five_control_points_is_named(tmp_path: Path, made: Generated) -> None:
+    """Too few to leave it out, but enough to tell which it is."""
+    file = survey(tmp_path / "s.csv", made, off={3: (6.0, 0.0, 0.0)}, points=5)
+    _, position = judged(made.model, file)
+    named = [o for o in position.objections if o.check == "contradiction"]
+    assert len(named) == 1 and "c3 is " in named[0].found
+    good = survey(tmp_path / "t.csv", made, points=5)
+    assert not [o for o in judged(made.model, good)[1].objections if o.check == "contradiction"]
+
+
 def test_check_points_only_measure(tmp_path: Path, made: Generated) -> None:
     file = survey(tmp_path / "s.csv", made, checks=range(8))
     ties, position = judged(made.model, file)

@@ -117,7 +117,7 @@ class Opened:
         return list(csv.DictReader(lines))
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844), (2560, 1440)])
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
 def test_points_are_marked_by_mouse_and_keyboard(
     browser: Any, page: Path, tmp_path: Path, width: int, height: int
 ) -> None:

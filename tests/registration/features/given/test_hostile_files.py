@@ -1,6 +1,7 @@
 """Files of strangers: each ends in one message, and nothing outside of them is read."""
 
 import sqlite3
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -135,3 +136,11 @@ def test_matches_of_other_features_are_refused() -> None:
     for bad in ([[4, 0]], [[0, -1]]):
         with pytest.raises(ChronoSceneError, match="indices into 4 and 2 keypoints"):
             checked_matches("m", np.array(bad), (4, 2))
+
+
+def test_the_package_is_named_that_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ChronoSceneError, match=r"pip install 'chronoscene\[hloc\]'"):
+        HlocFile(tmp_path / "f.h5")
