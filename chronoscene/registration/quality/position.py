@@ -309,9 +309,7 @@ def _words(
     if level == "pass" and found is not None:
         return f"Check points, which took no part in the estimation: {found.text}."
     if level == "pass" and left_out is not None:
-        return (
-            f"Control points, each placed by photos that were adjusted without it: {left_out.text}."
-        )
+        return f"Control points, each without its own coordinates in turn: {left_out.text}."
     first = objections[0]
     start = (
         "The model does not lie where surveyed points are."

@@ -39,7 +39,7 @@ DECIMALS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """What has coordinates: images and points in a local frame."""
+    """Images and points in a local frame."""
 
     names: Sequence[str]
     labels: Sequence[str]

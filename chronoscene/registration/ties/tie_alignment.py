@@ -215,13 +215,12 @@ def _to_control(
     source = placed.xyz[[i for i, _ in known]].reshape(-1, 3)
     target = np.array([control[name] for _, name in known]).reshape(-1, 3)
     names, sigma = [name for _, name in known], points.sigmas()
-    against = [CONTRADICTION + c for c in contradictions(names, source, target)]
     found = fit_control(source, target, [sigma.get(name) for name in names])
     if found is None:
         remark = (
             f"{len(known)} control points can be placed; three that are not collinear are needed"
         )
-        return model, set(), [remark, *against]
+        return model, set(), [remark]
     move, used = found
     rejected = [name for (_, name), u in zip(known, used, strict=True) if not u]
     note = f"; without {', '.join(rejected)}" if rejected else ""
@@ -231,7 +230,9 @@ def _to_control(
         cam_from_world=move.apply_to_pose(model.cam_from_world),
     )
     kept = {name for (_, name), u in zip(known, used, strict=True) if u}
-    return there, kept, [f"moved to {len(kept)} control points{note}", *against]
+    against = contradictions(names, source, target) if used.all() else []
+    remarks = [f"moved to {len(kept)} control points{note}"]
+    return there, kept, remarks + [CONTRADICTION + c for c in against]
 
 
 def tie(

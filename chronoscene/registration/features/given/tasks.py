@@ -27,7 +27,7 @@ from chronoscene.registration.features.given.source import (
 )
 
 Given = Mapping[str, Any]
-"""Of `source.find_sources`."""
+"""Result of `source.find_sources`."""
 
 NONE = (np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8))
 
