@@ -28,7 +28,7 @@ NOTHING = 1e-4  # Weight of east seen from the south: it is seen from above alre
 _FROM_ABOVE = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 _FROM_SOUTH = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
-CONTROL_COLOR = np.array([255, 255, 255], np.uint8)
+CLICKED_COLOR = np.array([255, 255, 255], np.uint8)
 
 
 def adjust_with_control(
@@ -50,7 +50,7 @@ def adjust_with_control(
     Returns:
         Id of the point of each control point.
     """
-    ids = {str(c["name"]): _add_point(model, c) for c in control}
+    ids = {str(c["name"]): add_point(model, c) for c in control}
     work = pycolmap.Reconstruction(model)  # with the cameras that stand for coordinates
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(work.reg_image_ids()):
@@ -87,15 +87,15 @@ def drop_bad(model: pycolmap.Reconstruction) -> None:
     model.update_point_3d_errors()
 
 
-def _add_point(model: pycolmap.Reconstruction, point: Mapping[str, Any]) -> int:
-    """Add a control point with its clicks as observations; its id."""
+def add_point(model: pycolmap.Reconstruction, point: Mapping[str, Any]) -> int:
+    """Add a clicked point with its clicks as observations; its id."""
     images = {str(image.name): i for i, image in model.images.items()}
     track = pycolmap.Track()
     for name, x, y in point["clicks"]:
         points2D = model.images[images[name]].points2D
         points2D.append(pycolmap.Point2D(np.array([x, y], np.float64)))
         track.add_element(images[name], len(points2D) - 1)
-    return int(model.add_point3D(np.array(point["xyz"], np.float64), track, CONTROL_COLOR))
+    return int(model.add_point3D(np.array(point["xyz"], np.float64), track, CLICKED_COLOR))
 
 
 def _add_coordinates(
