@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from chronoscene.arrays import Array
-from chronoscene.errors import ChronoSceneError, SceneError
+from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 
 STEP = 10.0
 """Metres to either side over which a projection is differentiated: curvature cancels out."""
@@ -65,24 +65,27 @@ class ReferenceSystem:
     """A projected or geographic reference system.
 
     Coordinates are east, north, height, or longitude, latitude, height. Heights are those of
-    `Georeference`, unchanged.
+    `Georeference`, in the unit of the system, otherwise unchanged.
     """
 
     text: str
     """Its name for PROJ, such as ``EPSG:32632``."""
     is_projected: bool
+    unit: float = 1.0
+    """Metres in a unit of its coordinates, such as a foot; 1 for degrees, whose heights are in
+    metres."""
 
     def to_local(self, frame: Georeference, xyz: Array) -> Array:
         """Coordinates in this system to a local frame; not finite outside its area. [N, 3]"""
         longitude, latitude = _to_wgs84(self.text).transform(xyz[:, 0], xyz[:, 1])
-        return frame.to_enu(latitude, longitude, xyz[:, 2])
+        return frame.to_enu(latitude, longitude, self.unit * xyz[:, 2])
 
     def from_local(self, frame: Georeference, enu: Array) -> Array:
         """Inverse of `to_local`. [N, 3]"""
         latitude, longitude, height = frame.to_geodetic(enu).T
         inverse: Any = "INVERSE"
         x, y = _to_wgs84(self.text).transform(longitude, latitude, direction=inverse)
-        return np.column_stack([x, y, height])
+        return np.column_stack([x, y, height / self.unit])
 
     def derivative(self, frame: Georeference, enu: Array) -> Array:
         """Derivative of the coordinates by those of the local frame. [N, 3] -> [N, 3, 3]"""
@@ -99,8 +102,8 @@ def read_reference_system(
     """Parse a reference system.
 
     Raises:
-        ChronoSceneError: If PROJ does not know it, if it is neither geographic nor projected in
-            metres, if it has heights of its own, or if PROJ lacks the grid that it needs.
+        ChronoSceneError: If PROJ does not know it, if it is neither geographic nor projected, if
+            it has heights of its own, or if PROJ lacks the grid that it needs.
     """
     import pyproj
     from pyproj.transformer import TransformerGroup
@@ -116,9 +119,8 @@ def read_reference_system(
     if crs.is_compound:
         todo = "give its horizontal part alone: heights stay as they are stated"
         raise wrong(", which has heights above a geoid", todo)
-    units = {axis.unit_name for axis in crs.axis_info}
-    if not crs.is_geographic and not (crs.is_projected and units == {"metre"}):
-        raise wrong(f", with axes in {', '.join(sorted(units))}", "convert to one in metres")
+    if not crs.is_geographic and not crs.is_projected:
+        raise wrong(f", which is {crs.type_name.lower()}", "convert to a projected one")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns of what is refused below
         group = TransformerGroup(crs, "EPSG:4326", always_xy=True)
@@ -128,7 +130,25 @@ def read_reference_system(
             f", which PROJ converts exactly only with the grid {', '.join(grids)}",
             "install it (pyproj sync), or convert to a system on WGS 84",
         )
-    return ReferenceSystem(text, bool(crs.is_projected))
+    unit = float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected else 1.0
+    return ReferenceSystem(text, bool(crs.is_projected), unit)
+
+
+def read_projected(place: str, text: str, *, metres: bool = False) -> ReferenceSystem:
+    """Parse the reference system of an output, which must be projected, and in metres if asked.
+
+    Raises:
+        ConfigError: If it is not, or as `read_reference_system`.
+    """
+    system = read_reference_system(place, text, error=ConfigError)
+    if not system.is_projected or (metres and system.unit != 1):
+        raise ConfigError(
+            f"{place} {text}",
+            expected=f"a projected reference system{' in metres' * metres}, such as EPSG:32632",
+            found="one in feet" if system.is_projected else "one in degrees",
+            todo="choose the UTM zone of the place, for example",
+        )
+    return system
 
 
 def from_crs(crs: str | None) -> Georeference | None:

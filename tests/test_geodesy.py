@@ -68,8 +68,7 @@ def test_median_longitude_across_the_antimeridian() -> None:
     [
         ("nonsense", "'nonsense'"),
         ("EPSG:32632+5773", "heights above a geoid"),
-        ("EPSG:4978", "axes in metre"),
-        ("EPSG:2229", "US survey foot"),
+        ("EPSG:4978", "geocentric"),
         ("EPSG:27700", "grid"),
     ],
 )
@@ -77,6 +76,18 @@ def test_systems_that_would_be_converted_wrongly_are_refused(text: str, found: s
     with pytest.raises(SceneError, match=found) as caught:
         read_reference_system("points.csv:1", text)
     assert caught.value.place == "points.csv:1"
+
+
+def test_coordinates_in_feet_have_heights_in_feet() -> None:
+    metres, feet = read_reference_system("", "EPSG:6423"), read_reference_system("", "EPSG:6424")
+    frame = Georeference(34.0, -118.0, 50.0, "as stated")
+    enu = np.array([[10.0, 20.0, 30.0], [-5.0, 0.0, 7.0]])
+    foot = 1200 / 3937
+    assert feet.unit == pytest.approx(foot, rel=1e-12)
+    np.testing.assert_allclose(
+        foot * feet.from_local(frame, enu), metres.from_local(frame, enu), rtol=1e-9
+    )
+    np.testing.assert_allclose(feet.to_local(frame, feet.from_local(frame, enu)), enu, atol=1e-6)
 
 
 def test_projected_coordinates_and_back() -> None:

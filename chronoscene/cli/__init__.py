@@ -27,6 +27,7 @@ COMMANDS = {
     "export": "chronoscene.cli.runs.export:command",
     "leakage": "chronoscene.cli.runs.leakage:command",
     "leaderboard": "chronoscene.cli.report.leaderboard:leaderboard_command",
+    "mark": "chronoscene.cli.scenes.mark:command",
     "methods": "chronoscene.cli.methods.methods:command",
     "new-method": "chronoscene.cli.methods.check_method:new",
     "page": "chronoscene.cli.runs.page:command",

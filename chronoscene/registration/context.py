@@ -37,6 +37,8 @@ class Options:
     """Number of photos up to which all pairs are matched."""
     held_out: float = 0.1
     """Share of the tracks across periods that take no part in the estimation."""
+    cameras: Path | None = None
+    """File of known calibrations; see `photos.known_cameras`."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP's camera model for the photos."""
     calibration: Calibration = "auto"
@@ -45,6 +47,10 @@ class Options:
     """None for one per processor. With 1, every run gives bit-identical results."""
     seed: int = 0
     """Seed of the draw of held-out tracks."""
+    features: str | None = None
+    """File of features, or an installed extractor, instead of SIFT."""
+    matches: str | None = None
+    """File of matches between these features, or an installed matcher."""
     tie_points: Path | None = None
     """File of tie points or ground control."""
     tie_scale: float = 1.0

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from chronoscene.colmap.model import copy_poses
 from chronoscene.errors import ConfigError
-from chronoscene.geodesy import ReferenceSystem, read_reference_system
+from chronoscene.geodesy import ReferenceSystem, read_projected
 from chronoscene.io.processes import Report
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
@@ -18,7 +19,8 @@ from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import PhotoInputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.extension import add_period
-from chronoscene.registration.report.coordinates import write_coordinates
+from chronoscene.registration.reconstruct.known_control import check_options, resect_photos
+from chronoscene.registration.report.coordinates import placed_model, write_coordinates
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
 from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
@@ -65,9 +67,10 @@ def run(
             found="--into, which does not move existing poses",
             todo="omit one of the two",
         )
+    check_options(options)
     output.check_free(out, overwrite=options.overwrite)
     work = options.work_folder(out)
-    crs = _output_system(options.crs)
+    crs = None if options.crs is None else read_projected("--crs", options.crs)
     points = None
     if options.tie_points is not None:
         points = read_tie_points(options.tie_points, scale=options.tie_scale, crs=crs)
@@ -77,9 +80,16 @@ def run(
         context = Context(work, Stages(work), options, report, lock)
         inputs = gather(captures, into, context)
         matched = find_matches(inputs, context)
-        registered, ties = _tie(estimate(inputs, matched, context), points, crs, inputs, context)
+        ties: TieAlignment | None
+        if options.route == "resection" and points is not None:
+            registered, ties = resect_photos(inputs, matched, points, crs, context)
+            context.stages.remark("tie points", *ties.remarks)
+        else:
+            found_model = estimate(inputs, matched, context)
+            registered, ties = _tie(found_model, points, crs, inputs, context)
+        registered = replace(registered, features=matched.made_by)
         staged = _stage_scene(registered, inputs, out.resolve().name, context)
-        if ties is not None and ties.replaced:
+        if ties is not None and (ties.replaced or ties.controlled):
             points = None  # they are points of the model already
         found = inspect_registration(
             registered,
@@ -91,28 +101,13 @@ def run(
         )
         for name, judged in (("alignment", found.verdict), ("absolute position", found.position)):
             context.stages.remark(name, f"{judged.level}: {judged.text}")
-        write_coordinates(staged, registered, crs)
+        write_coordinates(staged, placed_model(registered), registered.georeference, crs)
         output.write_log(staged, _log(registered, inputs, context))
         output.check_free(out, overwrite=options.overwrite)
         output.publish(staged, out)
     if inspected is not None:
         inspected(found)
     return registered
-
-
-def _output_system(text: str | None) -> ReferenceSystem | None:
-    """Parse the reference system of the output; it must be projected."""
-    if text is None:
-        return None
-    crs = read_reference_system("--crs", text, error=ConfigError)
-    if not crs.is_projected:
-        raise ConfigError(
-            "--crs",
-            expected="a projected reference system in metres, such as EPSG:32632",
-            found=f"{text!r}, which is in degrees",
-            todo="choose the UTM zone of the place, for example",
-        )
-    return crs
 
 
 def _tie(

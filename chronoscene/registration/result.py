@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference
+from chronoscene.registration.features import METHOD
 from chronoscene.scene import Camera
 
-Route = Literal["joint", "frozen", "separate"]
+Route = Literal["joint", "frozen", "separate", "resection"]
 
-ROUTES: tuple[Route, ...] = ("joint", "frozen", "separate")
+ROUTES: tuple[Route, ...] = ("joint", "frozen", "separate", "resection")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +56,18 @@ class HeldOutTracks:
     @classmethod
     def empty(cls) -> HeldOutTracks:
         return cls(np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Resection:
+    """Precision of poses that surveyed points fix, by two measures."""
+
+    deviations: Mapping[str, tuple[list[float], list[float]]]
+    """Standard deviations by photo, from the adjustment: of its centre in world units, and of its
+    turns about the axes of the world in degrees. Empty if the points do not fix all poses."""
+    left_out: Mapping[str, tuple[list[float], list[float]] | None]
+    """Error of each control point in an adjustment to which its coordinates are unknown, and the
+    standard deviations of that, world units; None if the others do not fix the poses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +116,10 @@ class Registered:
     """Folder of the images: photos as ``cameras`` describe them."""
     unplaced: frozenset[str] = frozenset()
     """Images of periods that are in a frame of their own, to be placed by tie points."""
+    features: str = METHOD
+    """Name of the features and matches."""
+    resection: Resection | None = None
+    """Precision of poses that surveyed points fix."""
 
     @property
     def unit(self) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.geodesy import STEP, ReferenceSystem, from_crs, read_reference_system
+from chronoscene.geodesy import STEP, from_crs, read_projected
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.orbit import find_up
@@ -127,12 +127,12 @@ def _conversion(
     """Name of the reference system of the map, and the transform of world coordinates to it."""
     local = from_crs(world_crs)
     if local is not None:
-        target = _projected("--crs", crs or _utm(local.latitude, local.longitude))
+        target = read_projected("--crs", crs or _utm(local.latitude, local.longitude), metres=True)
         return target.text, lambda xyz: target.from_local(local, xyz)
     import pyproj
 
-    source = _projected(str(scene.root), world_crs)
-    target = source if crs is None else _projected("--crs", crs)
+    source = read_projected(str(scene.root), world_crs, metres=True)
+    target = source if crs is None else read_projected("--crs", crs, metres=True)
     transform = pyproj.Transformer.from_crs(source.text, target.text, always_xy=True).transform
 
     def convert(xyz: Array) -> Array:
@@ -140,18 +140,6 @@ def _conversion(
         return np.column_stack([*transform(east, north), height])
 
     return target.text, convert
-
-
-def _projected(place: str, text: str) -> ReferenceSystem:
-    system = read_reference_system(place, text, error=ConfigError)
-    if not system.is_projected:
-        raise ConfigError(
-            f"{place} {text}",
-            expected="a projected reference system in metres, such as EPSG:32632",
-            found="one in degrees",
-            todo="choose a projected one with --crs",
-        )
-    return system
 
 
 def _utm(latitude: float, longitude: float) -> str:

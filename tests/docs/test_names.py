@@ -23,7 +23,8 @@ PAGES = [
     ).stdout.splitlines()
     if not path.startswith("chronoscene/cli/methods/skeleton")
 ]
-GROUPS = ("chronoscene.programs",)  # Of entry points that are no modules
+GROUPS = ("chronoscene.programs", "chronoscene.extractors", "chronoscene.matchers")
+"""Groups of entry points, which are no modules."""
 PACKAGES = ("chronoscene", "chronogs", "baselines", "leaderboard", "benchmarks")
 BASES = (ROOT, ROOT / "chronoscene")
 

@@ -123,6 +123,19 @@ def test_held_out_tracks_are_not_points_of_the_model(joint: tuple[Path, Register
     assert not held & used
 
 
+def test_features_of_a_database_are_used_and_named(
+    joint: tuple[Path, Registered], captures: Path, truth: Scene, tmp_path: Path
+) -> None:
+    database = shutil.copy(joint[0].with_name("scene.work") / "features.db", tmp_path)
+    options = Options(threads=1, features=str(database), max_features=100)  # were SIFT extracted
+    registered = run(read_captures(captures), tmp_path / "out", options)
+    assert len(registered.names) == len(joint[1].names)
+    assert len(registered.points) > 0.8 * len(joint[1].points)
+    assert max(errors(read_scene(tmp_path / "out"), truth, 0)) < 0.5
+    certificate = json.loads((tmp_path / "out/registration.json").read_text())
+    assert certificate["features"].startswith("features of features.db (COLMAP, SHA-256 ")
+
+
 def test_route_separate(
     joint: tuple[Path, Registered], captures: Path, truth: Scene, tmp_path: Path
 ) -> None:

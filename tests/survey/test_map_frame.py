@@ -76,6 +76,7 @@ def test_local_metres(scene):
         (WorldFrame(), None, SceneError, "a scene in metres, found unit unknown"),
         (WorldFrame("metre"), "EPSG:32632", ConfigError, "a scene with a georeference, found none"),
         (WorldFrame("metre", PLACE.crs), "EPSG:4326", ConfigError, "found one in degrees"),
+        (WorldFrame("metre", PLACE.crs), "EPSG:6424", ConfigError, "found one in feet"),
         (WorldFrame("metre", PLACE.crs), "EPSG:99999", ConfigError, "that PROJ knows"),
         (WorldFrame("metre", PLACE.crs), "EPSG:32755", ConfigError, "metres are metres"),
         (WorldFrame("metre", PLACE.crs), "EPSG:3857", ConfigError, r"found scale 1\.45"),

@@ -12,7 +12,10 @@ from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, describe_period, show_note
 from chronoscene.convert import convert
+from chronoscene.errors import ConfigError
 from chronoscene.formats import writable_formats
+from chronoscene.geodesy import from_crs, read_projected
+from chronoscene.registration.report.coordinates import placed_scene, write_coordinates
 from chronoscene.scene.splits import split_hash
 
 
@@ -28,6 +31,11 @@ from chronoscene.scene.splits import split_hash
     help="Format of OUT.",
 )
 @LINK
+@click.option(
+    "--crs",
+    help="Also write cameras.csv and points.ply in this projected reference system, such as "
+    "EPSG:32632, for a scene that is georeferenced.",
+)
 def command(
     source: Path,
     out: Path,
@@ -35,6 +43,7 @@ def command(
     period_by: str | None,
     target: str,
     link: str | None,
+    crs: str | None,
 ) -> None:
     """Convert a scene to another format.
 
@@ -42,6 +51,7 @@ def command(
     complete or not at all. Notes list what the target format cannot hold. DATASET.md describes the
     formats.
     """
+    system = None if crs is None else read_projected("--crs", crs)
     with progress_bar(f"read {source}") as bar:
         done = convert(
             source,
@@ -53,6 +63,14 @@ def command(
             progress=partial(bar, "images"),
         )
     scene = done.scene
+    if system is not None:
+        frame = from_crs(scene.world.crs)
+        if frame is None:
+            raise ConfigError(
+                "--crs", expected="a georeferenced scene", found=f"{source}, which is not: {out} "
+                "was written without coordinates", todo="register it with GPS or ground control",
+            )  # fmt: skip
+        write_coordinates(out, placed_scene(scene), frame, system)
     lines = [f"{out}: {target} from {scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")

@@ -37,8 +37,9 @@ FAILED = 1  # Exit status if a verdict is fail
 @click.option(
     "--route",
     type=click.Choice([r for r in ROUTES if r != "frozen"]),
-    help="joint: all photos in one reconstruction; separate: one for each period, then aligned.  "
-    "[default: joint if matches connect all periods]",
+    help="joint: all photos in one reconstruction; separate: one for each period, then aligned; "
+    "resection: known cameras placed by control points, for few photos.  [default: joint if "
+    "matches connect all periods]",
 )
 @click.option(
     "--work",
@@ -72,6 +73,12 @@ FAILED = 1  # Exit status if a verdict is fail
     help="Share of the tracks across periods that are used only to test the result.",
 )
 @click.option(
+    "--cameras",
+    type=EXISTING_FILE,
+    help="Known calibrations: lines of a pattern of photo names, then model, width, height and "
+    "parameters as in COLMAP's cameras.txt. --route resection keeps them, others refine them.",
+)
+@click.option(
     "--camera-model",
     type=click.Choice(["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]),
     default=DEFAULTS.camera_model,
@@ -88,6 +95,16 @@ FAILED = 1  # Exit status if a verdict is fail
     "--threads",
     type=click.IntRange(1),
     help="With 1, every run gives bit-identical results.  [default: one per processor]",
+)
+@click.option(
+    "--features",
+    help="Features in place of SIFT: features.h5 of hloc, a database of COLMAP, or an installed "
+    "extractor.",
+)
+@click.option(
+    "--matches",
+    help="Matches of these features: matches.h5 of hloc, a database of COLMAP, or an installed "
+    "matcher.  [default: those of a database, else mutual nearest neighbours]",
 )
 @click.option(
     "--tie-points",

@@ -9,7 +9,9 @@ from typing import Any
 from chronoscene.registration.context import Context
 from chronoscene.registration.features import METHOD
 from chronoscene.registration.features.camera_groups import camera_groups, scene_groups
+from chronoscene.registration.features.given.source import describe, find_sources
 from chronoscene.registration.photos.inputs import PhotoInputs
+from chronoscene.registration.photos.known_cameras import known_groups
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,29 +25,42 @@ class Matched:
     pairs_across: Mapping[str, int]
     """Verified pairs of photos between two periods, by ``"0-1"``."""
     matches_across: Mapping[str, int]
+    made_by: str = METHOD
+    """Name of the features, and of the matches where they were given."""
+    absent: frozenset[str] = frozenset()
+    """Photos that the given file of features lacks."""
 
 
 def find_matches(inputs: PhotoInputs, context: Context) -> Matched:
     """Extract features, match photos, and hold out tracks, unless an earlier run did."""
-    features = _features(inputs, context)
-    found = _matches(inputs, context)
+    given = find_sources(context.options.features, context.options.matches)
+    setting = {} if given is None else {"given": given}  # without, records are as they were before
+    features = _features(inputs, context, setting)
+    found = _matches(inputs, context, setting)
     return Matched(
         keypoints=features["keypoints"],
         partners=found["partners"],
         pairs_across=found["verified_pairs_across"],
         matches_across=found["matches_across"],
+        made_by=METHOD if given is None else describe(given),
+        absent=frozenset(features.get("absent", ())),
     )
 
 
-def _features(inputs: PhotoInputs, context: Context) -> dict[str, Any]:
+def _features(inputs: PhotoInputs, context: Context, given: Mapping[str, Any]) -> dict[str, Any]:
     options = context.options
-    groups = camera_groups(inputs.images, options.camera_model, options.calibration)
+    if options.cameras is not None:
+        groups = known_groups(options.cameras, inputs.images)
+    else:
+        groups = camera_groups(inputs.images, options.camera_model, options.calibration)
     if inputs.scene is not None:
         groups = scene_groups(inputs.scene) + groups
-    return extract_features(groups, context)
+    return extract_features(groups, context, given)
 
 
-def extract_features(groups: Sequence[Mapping[str, Any]], context: Context) -> dict[str, Any]:
+def extract_features(
+    groups: Sequence[Mapping[str, Any]], context: Context, given: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Extract the features of groups of photos that share a camera; see `extraction.extract`."""
     options = context.options
     settings = {
@@ -53,6 +68,7 @@ def extract_features(groups: Sequence[Mapping[str, Any]], context: Context) -> d
         "groups": groups,
         "max_image_size": options.max_image_size,
         "max_features": options.max_features,
+        **(given or {}),
     }
     places = {
         "database": str(context.database),
@@ -70,7 +86,9 @@ def extract_features(groups: Sequence[Mapping[str, Any]], context: Context) -> d
             f"cameras, {sum(found['focal_known'].values())} with a focal length from EXIF or the "
             "scene"
         )
-        return found, [remark, *_reused(found["carried"], count, "photos: features")]
+        reused = _reused(found["carried"], count, "photos: features")
+        lost = [f"{name}: not in the file of features" for name in found["absent"]]
+        return found, [remark, *reused, *lost, *found["remarks"]]
 
     return dict(context.stages.run("features", settings, extract))
 
@@ -79,7 +97,7 @@ def _reused(count: int, total: int, what: str) -> list[str]:
     return [f"{count} of {total} {what} reused from an earlier run"] if count else []
 
 
-def _matches(inputs: PhotoInputs, context: Context) -> dict[str, Any]:
+def _matches(inputs: PhotoInputs, context: Context, given: Mapping[str, Any]) -> dict[str, Any]:
     options = context.options
     centres = inputs.centres()
     taken = {c.name: c.taken.isoformat() for c in inputs.images if c.taken is not None}
@@ -93,6 +111,7 @@ def _matches(inputs: PhotoInputs, context: Context) -> dict[str, Any]:
         "periods": inputs.periods,
         "share": options.held_out,
         "seed": options.seed,
+        **given,
     }
     places = {
         "database": str(context.database),

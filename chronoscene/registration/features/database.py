@@ -14,7 +14,8 @@ SEED = 0
 
 Features = tuple[np.ndarray, np.ndarray]
 """Keypoints [K, 6], float32: x and y in pixels of the photo, and the 2 x 2 matrix of scale and
-rotation by rows; descriptors [K, 128], uint8."""
+rotation by rows; descriptors [K, 128], uint8. Given ones may lack the matrix, and have descriptors
+[K, D] of float32."""
 
 
 def quiet() -> None:
@@ -42,9 +43,21 @@ def store_features(database: str, name: str, features: Features) -> None:
         assert image is not None
         if not opened.exists_descriptors(image.image_id):
             kind = pycolmap.FeatureExtractorType.SIFT
+            if descriptors.dtype != np.uint8:
+                kind = pycolmap.FeatureExtractorType.UNDEFINED
+                descriptors = np.ascontiguousarray(descriptors, np.float32).view(np.uint8)
             found = pycolmap.FeatureDescriptors(kind, descriptors)
             opened.write_descriptors(image.image_id, found)
         opened.write_keypoints(image.image_id, keypoints)
+
+
+def read_features(opened: pycolmap.Database, image_id: int) -> Features:
+    """Read what `store_features` wrote."""
+    found = opened.read_descriptors(image_id)
+    data = np.asarray(found.data)
+    if found.type != pycolmap.FeatureExtractorType.SIFT:
+        data = data.view(np.float32)
+    return np.asarray(opened.read_keypoints(image_id)), data
 
 
 def verified_matches(

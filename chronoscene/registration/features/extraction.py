@@ -2,8 +2,7 @@
 
 Images enter the database in the order of the photos, so ids are the same in every run. Features
 that are stored are not computed again, and those of the same photos in an earlier database are
-copied (`feature_reuse`). Another kind of features needs three things: an `Extractor`, here; a
-`matching.Matcher` of its descriptors; and another name (`features.METHOD`).
+copied (`feature_reuse`). Features that the user gives take the place of SIFT (`given`).
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import Features, quiet, store_features
 from chronoscene.registration.features.feature_reuse import record_of, renew
+from chronoscene.registration.features.given import tasks as given_features
 from chronoscene.registration.features.sift import photos_at_once, sift_features
 
 BATCH = 64  # Photos
@@ -30,15 +30,16 @@ Extractor = Callable[[Path, Path | None], Features]
 
 
 def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
-    """Import images and extract SIFT features.
+    """Import images and extract SIFT features, or take given ones.
 
     Arguments: ``database``, ``photos`` (folder), ``groups`` (lists of names that share a camera,
     each with ``names``, ``model`` and ``params`` or null), ``max_image_size``, ``max_features``,
-    ``threads``.
+    ``threads``, ``given`` (see `given.source.find_sources`; may be missing).
 
     Returns:
         ``keypoints``: number by name; ``focal_known``: whether the focal length of each camera is
-        known beforehand; ``carried``: number of photos with features from an earlier database.
+        known beforehand; ``carried``: number of photos with features from an earlier database;
+        ``absent``: photos that a given file lacks; ``remarks``.
     """
     quiet()
     database, photos, groups = (arguments[k] for k in ("database", "photos", "groups"))
@@ -49,6 +50,10 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         sift_features, max_image_size=size, max_features=arguments["max_features"]
     )
     names = sorted(name for group in groups for name in group["names"])
+    absent: list[str] = []
+    remarks: list[str] = []
+    if given := arguments.get("given"):
+        extractor, absent, remarks = given_features.extractor(given, Path(photos), names)
     left = _without_features(database, names)
     threads = photos_at_once(size, arguments["threads"])
     found = _features(extractor, Path(photos), left, threads)
@@ -66,6 +71,8 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         "keypoints": {name: counts[name] for name in names},
         "focal_known": known,
         "carried": reused,
+        "absent": absent,
+        "remarks": remarks,
     }
 
 

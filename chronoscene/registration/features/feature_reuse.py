@@ -37,7 +37,8 @@ def record_of(arguments: Mapping[str, Any]) -> Record:
     files = [[folder / name, *([masks[name]] if name in masks else [])] for name in names]
     with ThreadPoolExecutor(arguments["threads"]) as pool:
         digests = list(pool.map(lambda group: "".join(map(sha256_of, group)), files))
-    settings = {key: arguments[key] for key in ("max_image_size", "max_features")}
+    kept = ("max_image_size", "max_features", "given")
+    settings = {key: arguments[key] for key in kept if key in arguments}
     made_by = {"method": METHOD, "pycolmap": pycolmap.__version__, "opencv": cv2.__version__}
     return {
         "settings": settings | made_by,

@@ -1,7 +1,8 @@
 """The task ``matches``: pairs of photos, verified matches, held-out tracks. Worker process only.
 
 A `Matcher` gives the matches (`nearest.mutual_matches`), and COLMAP verifies them by geometry.
-Matches that are in the database already are verified as they are; verified pairs are kept.
+Matches that are in the database already are verified as they are, those of a given file among them
+(`given.tasks.import_matches`); verified pairs are kept.
 """
 
 from __future__ import annotations
@@ -17,14 +18,23 @@ from numpy.typing import NDArray
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import SEED, quiet, read_pairs, write_pairs
+from chronoscene.registration.features.given.tasks import (
+    import_matches,
+    load_features,
+    matcher,
+    matches_of,
+)
 from chronoscene.registration.features.holdout import hold_out
 from chronoscene.registration.features.nearest import Descriptors, mutual_matches
 from chronoscene.registration.features.pairs import choose_pairs
 
 BATCH = 64  # Pairs
 
-Matcher = Callable[[Descriptors, Descriptors], NDArray[np.uint32]]
-"""Match the descriptors of two images; indices [M, 2], sorted. Called by several threads."""
+Matcher = Callable[[Any, Any], NDArray[np.uint32]]
+"""Match two images as its loader gives them; indices [M, 2], sorted. Called by several threads."""
+
+Loader = Callable[[pycolmap.Database, int], Any]
+"""Read what a `Matcher` needs of an image."""
 
 INLIER_SHARES = ((45, 1 / 4), (30, 1 / 3), (20, 1 / 2), (0, 3 / 4))
 """From so many matches on, the share that must be inliers for COLMAP to draw enough samples. A pair
@@ -37,7 +47,8 @@ def match_photos(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]
 
     Arguments and results: those of `choose_pairs`, `match` and `hold_out`.
     """
-    chosen = choose_pairs(arguments, report)
+    imported = matches_of(arguments.get("given")) is not None
+    chosen = (import_matches if imported else choose_pairs)(arguments, report)
     return chosen | match(arguments, report) | hold_out(arguments, report)
 
 
@@ -45,7 +56,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Match and verify pairs of images, except those that are verified already.
 
     Arguments: ``database``, ``pairs`` (text file with two names a line), ``threads``,
-    ``scratch`` (folder).
+    ``scratch`` (folder), ``given`` (see `given.source.find_sources`; may be missing).
 
     Returns:
         Number of ``pairs``, of those ``verified``, of their ``inliers``, and of the pairs
@@ -62,9 +73,11 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     listed = Path(arguments["scratch"]) / "batch.txt"
+    given = arguments.get("given")
+    pairwise, load = (matcher(given), load_features) if given else (mutual_matches, load_sift)
     for first in range(0, len(left), BATCH):
         report("pairs", len(pairs) - len(left) + first, len(pairs))
-        found = store_matches(database, left[first : first + BATCH], mutual_matches, threads)
+        found = store_matches(database, left[first : first + BATCH], pairwise, threads, load)
         for least, share in INLIER_SHARES:
             write_pairs(listed, [pair for pair, count in found.items() if count >= least])
             found = {pair: count for pair, count in found.items() if count < least}
@@ -84,8 +97,17 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     }
 
 
+def load_sift(opened: pycolmap.Database, image_id: int) -> Descriptors:
+    """Read SIFT descriptors."""
+    return Descriptors.of(opened.read_descriptors(image_id).data)
+
+
 def store_matches(
-    database: str, pairs: Sequence[tuple[str, str]], matcher: Matcher, threads: int
+    database: str,
+    pairs: Sequence[tuple[str, str]],
+    matcher: Matcher,
+    threads: int,
+    load: Loader = load_sift,
 ) -> dict[tuple[str, str], int]:
     """Store matches of pairs of images, in the order of their ids, unless they are stored.
 
@@ -97,7 +119,7 @@ def store_matches(
         ordered = {(a, b): (min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in pairs}
         new = [pair for pair in pairs if not opened.exists_matches(*ordered[pair])]
         used = sorted({i for pair in new for i in ordered[pair]})
-        descriptors = {i: Descriptors.of(opened.read_descriptors(i).data) for i in used}
+        descriptors = {i: load(opened, i) for i in used}
         first, second = ([descriptors[ordered[pair][k]] for pair in new] for k in (0, 1))
         with ThreadPoolExecutor(threads) as pool:
             for pair, matches in zip(new, pool.map(matcher, first, second), strict=True):

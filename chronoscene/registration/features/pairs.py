@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from chronoscene.arrays import Array, Ints
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features.database import quiet, write_pairs
+from chronoscene.registration.features.database import quiet, read_features, write_pairs
 from chronoscene.scene.geometry import camera_centre
 
 SPATIAL_NEIGHBOURS = 10
@@ -150,22 +150,24 @@ def similar_pairs(descriptors: NDArray[np.float32], periods: Ints) -> set[Pair]:
 
 
 def global_descriptors(database: str | Path, names: Sequence[str]) -> NDArray[np.float32]:
-    """Global descriptors of images, unit length, zero without features. [N, WORDS * 128]"""
+    """Global descriptors of images, unit length, zero without features. [N, WORDS * D]"""
     local = [_local(database, name) for name in names]
+    columns = max(found.shape[1] for found in local)
+    local = [f if f.shape[1] == columns else np.zeros((0, columns), np.float32) for f in local]
     words = visual_words(np.concatenate(local))
     return np.stack([vlad(descriptors, words) for descriptors in local])
 
 
 def _local(database: str | Path, name: str) -> NDArray[np.float32]:
-    """Descriptors of the largest features of an image, with unit length. [K, 128]"""
+    """Descriptors of the largest features of an image, with unit length. [K, D]"""
     with pycolmap.Database.open(str(database)) as opened:
         image = opened.read_image_with_name(name)
         assert image is not None
-        keypoints = np.asarray(opened.read_keypoints(image.image_id))
-        data = np.asarray(opened.read_descriptors(image.image_id).data, np.float32)
-    if not len(data):
-        return np.zeros((0, 128), np.float32)
-    size = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+        keypoints, data = read_features(opened, image.image_id)
+    data = data.astype(np.float32)
+    size = np.ones(len(data))
+    if keypoints.shape[1] == 6:
+        size = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     data = data[np.argsort(-size, kind="stable")[:MAX_DESCRIPTORS]]
     return data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-6)
 
@@ -177,7 +179,7 @@ def visual_words(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
         descriptors = descriptors[rng.choice(len(descriptors), MAX_TRAINING, replace=False)]
     count = min(WORDS, max(1, len(descriptors)))
     if not len(descriptors):
-        return np.zeros((1, 128), np.float32)
+        return np.zeros((1, descriptors.shape[1]), np.float32)
     words = descriptors[rng.choice(len(descriptors), count, replace=False)].copy()
     for _ in range(ITERATIONS):
         nearest = assign(descriptors, words)
@@ -195,7 +197,7 @@ def assign(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> Ints
 
 
 def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Global descriptor of an image. [WORDS * 128]"""
+    """Global descriptor of an image. [WORDS * D]"""
     sums = np.zeros_like(words)
     if len(descriptors):
         nearest = assign(descriptors, words)

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from chronoscene.arrays import Array, Mask
+from chronoscene.registration.features import METHOD
 from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
@@ -33,7 +34,7 @@ from chronoscene.registration.quality.rays import (
     sampson_distance,
 )
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
-from chronoscene.registration.result import Registered
+from chronoscene.registration.result import Registered, Resection
 from chronoscene.scene.geometry import camera_centre
 
 BADLY_PLACED = 4.0  # Pixels; transfers whose point is less certain than this are ignored
@@ -115,6 +116,10 @@ class Certificate:
     """All pairs of periods, earlier first."""
     evidence: Evidence
     """Observations on which the figures are measured."""
+    features: str = METHOD
+    """Name of the features and matches that it was made with."""
+    resection: Resection | None = None
+    """Precision of poses that surveyed points fix."""
 
 
 def certify(model: Registered) -> Certificate:
@@ -128,6 +133,8 @@ def certify(model: Registered) -> Certificate:
     focals = [np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in model.cameras]
     return Certificate(
         route=model.route,
+        features=model.features,
+        resection=model.resection,
         unit=model.unit,
         extent=extent,
         focal=float(np.median(focals)) if focals else float("nan"),

@@ -16,6 +16,7 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.registration.quality.verdict import Level, Objection, Threshold, check, worst_level
 from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.control import CONTRADICTION
 from chronoscene.registration.ties.residuals import PointResidual
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 from chronoscene.scene.geometry import camera_centre
@@ -25,6 +26,8 @@ _COMPARE = (
     "errors (control.csv)"
 )
 _CHECK = "set some surveyed points aside as check points: role check in the file of --tie-points"
+
+_MOST_AGREE = "the other control points agree with each other, but not with it"
 
 POSITION_THRESHOLDS: dict[str, Threshold] = {
     "horizontal": Threshold(
@@ -45,6 +48,12 @@ POSITION_THRESHOLDS: dict[str, Threshold] = {
         doubtful=3, larger_is_better=True,
         why="fewer say nothing about a tilt of the model",
         todo=_CHECK,
+    ),
+    "left_out": Threshold(
+        what="error without its own coordinates, in standard deviations",
+        doubtful=4, fail=12,
+        why="the photos and the other points place it elsewhere than it was surveyed",
+        todo=_COMPARE,
     ),
     "gps": Threshold(
         what="horizontal distance of the surveyed position from GPS, median",
@@ -94,6 +103,8 @@ class Position:
     """Cameras against their GPS positions."""
     ground_pixel: float | None
     """Metres that a pixel covers, median over the surveyed points."""
+    left_out: Rmse | None = None
+    """Control points, each placed by an adjustment to which its coordinates are unknown."""
 
     @property
     def todo(self) -> tuple[str, ...]:
@@ -106,6 +117,7 @@ class Position:
         named = (
             ("check points", self.check),
             ("control points, which the model was fitted to", self.control),
+            ("control points, each without its coordinates in turn", self.left_out),
             ("cameras against GPS", self.gps),
         )
         return [(name, rmse) for name, rmse in named if rmse is not None]
@@ -124,27 +136,91 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     checks = [r for r in points if r.role == "check" or not controlled]
     used = [r for r in points if r.used]
     found, control, gps = _of_points(checks), _of_points(used), _against_gps(model)
+    left_out = _left_out(model)
     pixels = [r.ground_pixel for r in points if r.ground_pixel is not None]
     pixel = float(np.median(pixels)) if pixels else None
     objections = [
         *_errors("check points", found, pixel),
         *_errors("control points", control, pixel),
+        *_contradicted(model),
     ]
     objections += _rejected(
         [r for r in points if r.role == "control" and controlled and not r.used]
     )
+    objections += [
+        Objection("doubtful", "contradiction", "control points", remark, _MOST_AGREE, _COMPARE)
+        for remark in (ties.remarks if ties is not None else ())
+        if remark.startswith(CONTRADICTION)
+    ]
     if found is not None:
         objections += check(POSITION_THRESHOLDS["points"], found.count, "check points", "points")
     if points and gps is not None:
         gap = float(np.linalg.norm(np.median(_gps_errors(model)[1][:, :2], axis=0)))
         objections += check(POSITION_THRESHOLDS["gps"], gap, "ground control and GPS", "gps")
-    objections += _unproven(found, control, gps)
+    if model.resection is None or found is not None:
+        objections += _unproven(found, control, gps)
+    else:
+        objections += _open(model, pixel)
     objections.sort(key=lambda f: f.level != "fail")
     level: Level | Literal["not checked"] = worst_level(f.level for f in objections)
     if found is None and control is None and gps is None:
         level = "not checked"
-    text = _words(level, objections, found, ties)
-    return Position(level, text, tuple(objections), found, control, gps, pixel)
+    text = _words(level, objections, found, left_out, ties) + _precision(model)
+    return Position(level, text, tuple(objections), found, control, gps, pixel, left_out)
+
+
+def _errors_left_out(model: Registered) -> dict[str, tuple[Array, Array]]:
+    """Error of each control point without its coordinates, and its standard deviations."""
+    found = {} if model.resection is None else model.resection.left_out
+    return {k: (np.array(v[0]), np.array(v[1])) for k, v in found.items() if v is not None}
+
+
+def _left_out(model: Registered) -> Rmse | None:
+    errors = _errors_left_out(model)
+    return _rmse(list(errors), np.array([error for error, _ in errors.values()]))
+
+
+def _contradicted(model: Registered) -> Iterator[Objection]:
+    """Objections to control points that lie elsewhere than the others say."""
+    for name, (error, spread) in _errors_left_out(model).items():
+        ratio = float(np.abs(error / np.maximum(spread, 1e-9)).max())
+        distance, left = np.linalg.norm(error), np.linalg.norm(spread)
+        note = f" ({distance:.3g} m, of which the others leave {left:.2g} m open)"
+        place = f"control point {name}"
+        yield from check(POSITION_THRESHOLDS["left_out"], ratio, place, "left_out", note)
+
+
+def _open(model: Registered, pixel: float | None) -> Iterator[Objection]:
+    """An objection where the other points fix one only roughly, so that it proves nothing."""
+    limit = (pixel or 0.0) * (POSITION_THRESHOLDS["horizontal"].fail or 0.0)
+    errors = _errors_left_out(model)
+    spread = {name: float(np.linalg.norm(errors[name][1])) for name in errors}
+    for name in model.resection.left_out if model.resection is not None else ():
+        spread.setdefault(name, float("inf"))
+    worst = max(spread, key=lambda name: spread[name], default="")
+    if spread and spread[worst] > limit:
+        how = f"{spread[worst]:.2g} m" if errors.get(worst) is not None else "any distance"
+        yield Objection(
+            "doubtful", "independent", "control points",
+            f"the others leave {how} of {worst} open, where its coordinates are unknown",
+            "a point that the others do not fix cannot confirm them",
+            "mark more control points, spread over the photos, or set some aside as check points",
+        )  # fmt: skip
+
+
+def _precision(model: Registered) -> str:
+    """Standard deviations of the poses in words."""
+    if model.resection is None:
+        return ""
+    if not model.resection.deviations:
+        return " The control points do not fix all poses."
+    spreads = list(model.resection.deviations.values())
+    centre = max(float(np.linalg.norm(c)) for c, _ in spreads)
+    turn = max(max(angles) for _, angles in spreads)
+    return (
+        f" By the adjustment, every camera is known to {centre:.2g} m and {turn:.2g} degrees or "
+        "better (one standard deviation)."
+    )
 
 
 def _of_points(points: Sequence[PointResidual]) -> Rmse | None:
@@ -196,7 +272,7 @@ def _rejected(points: Sequence[PointResidual]) -> Iterator[Objection]:
         found = f"{np.linalg.norm(r.error or 0.0):.3g} m off, so it was left out"
         yield Objection(
             "doubtful", "outlier", f"control point {r.name}", found,
-            "the other control points agree with each other, but not with it", _COMPARE,
+            _MOST_AGREE, _COMPARE,
         )  # fmt: skip
 
 
@@ -219,7 +295,11 @@ def _unproven(found: Rmse | None, control: Rmse | None, gps: Rmse | None) -> Ite
 
 
 def _words(
-    level: str, objections: Sequence[Objection], found: Rmse | None, ties: TieAlignment | None
+    level: str,
+    objections: Sequence[Objection],
+    found: Rmse | None,
+    left_out: Rmse | None,
+    ties: TieAlignment | None,
 ) -> str:
     if level == "not checked":
         why = "there is no ground control, and GPS was not used"
@@ -228,6 +308,8 @@ def _words(
         return f"Where the model lies in the world is unknown: {why}."
     if level == "pass" and found is not None:
         return f"Check points, which took no part in the estimation: {found.text}."
+    if level == "pass" and left_out is not None:
+        return f"Control points, each without its own coordinates in turn: {left_out.text}."
     first = objections[0]
     start = (
         "The model does not lie where surveyed points are."

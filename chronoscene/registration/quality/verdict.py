@@ -205,6 +205,8 @@ class Verdict:
 
 def judge(certificate: Certificate) -> Verdict:
     """Judge a registration by its certificate."""
+    if certificate.route == "resection":
+        return _judge_resection(certificate)
     objections = [f for p in certificate.periods for f in _of_period(p)]
     objections += _between_gps(certificate)
     pairs: dict[tuple[int, int], Level | None] = {}
@@ -221,6 +223,26 @@ def judge(certificate: Certificate) -> Verdict:
     objections += _links(certificate, pairs, good)
     level = worst_level(f.level for f in objections)
     objections.sort(key=lambda f: -LEVELS.index(f.level))
+    return Verdict(level, _words(certificate, level, objections), tuple(objections), pairs)
+
+
+def _judge_resection(certificate: Certificate) -> Verdict:
+    """Judge photos that surveyed points placed: too few for the measurements between periods."""
+    objections = [f for p in certificate.periods for f in _of_period(p) if f.check != "images"]
+    if len(certificate.labels) > 1:
+        objections.append(
+            Objection(
+                "doubtful",
+                "control",
+                "the periods",
+                "each is placed by the control points alone",
+                "no match that took no part in it measures them against each other; how well the "
+                "poses are known is said under absolute position",
+                "add photos that overlap, for an independent measurement",
+            )
+        )
+    level = worst_level(f.level for f in objections)
+    pairs: dict[tuple[int, int], Level | None] = {(p.a, p.b): None for p in certificate.pairs}
     return Verdict(level, _words(certificate, level, objections), tuple(objections), pairs)
 
 

@@ -122,6 +122,7 @@ def _run_route(route: Route, inputs: PhotoInputs, matched: Matched, context: Con
     registered = _assemble(route, route, result, inputs, context)
     missing = set(inputs.periods) - set(registered.names)
     lost = reasons(missing, matched.keypoints, matched.partners, result["left"])
+    lost |= dict.fromkeys(missing & matched.absent, "not in the file of features")
     registered = replace(registered, unplaced=frozenset(result["unplaced"]))
     return _with_lost(registered, lost, inputs)
 
@@ -135,6 +136,17 @@ def refined(
     lost = set(registered.names) - set(again.names)
     reason = "lost when the model was adjusted with tie points"
     return _with_lost(again, dict(registered.unregistered) | dict.fromkeys(lost, reason), inputs)
+
+
+def resected(
+    arguments: Mapping[str, Any], inputs: PhotoInputs, matched: Matched, context: Context
+) -> tuple[Registered, dict[str, Any]]:
+    """The model that the task ``resection`` makes, and its result."""
+    result = _estimate("resection", "resection", dict(arguments), context)
+    registered = _assemble("resection", "resection", result, inputs, context)
+    reason = "fewer than three clicked control points, or several poses that fit them"
+    lost = dict.fromkeys(set(inputs.periods) - set(registered.names), reason)
+    return _with_lost(registered, lost, inputs), result
 
 
 def _estimate(task: str, name: str, settings: dict[str, Any], context: Context) -> dict[str, Any]:

@@ -22,6 +22,11 @@ from chronoscene.registration.reconstruct.consistency import (
     deregister_misplaced,
     pair_agreements,
 )
+from chronoscene.registration.reconstruct.control_adjustment import (
+    add_point,
+    adjust_with_control,
+    drop_bad,
+)
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
 from chronoscene.registration.reconstruct.mapping import (
     Task,
@@ -41,8 +46,6 @@ MIN_AGREEMENT = 0.5
 
 ROUNDS = 2  # Of triangulation with all matches and bundle adjustment, after merging
 ATTEMPTS = 2  # To register an image: at the second, more of the others have poses
-
-TIE_COLOR = np.array([255, 255, 255], np.uint8)
 
 
 def joint(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -212,8 +215,8 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Triangulate at given poses, add tie points, adjust, and write the model.
 
     Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (parameters by
-    name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``out``, ``scratch``,
-    ``threads``.
+    name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``control`` (see
+    `control_adjustment.adjust_with_control`), ``out``, ``scratch``, ``threads``.
     """
     task = Task.start(arguments, report)
     model = known_images(task.database)
@@ -223,9 +226,15 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     for i in range(2):
         report("adjusting", i, 2)
         model = triangulate(model, task, "")
-        _add_ties(model, arguments["ties"])
-        adjust(model, threads=task.threads)
-    task.remarks.append(f"adjusted with {len(arguments['ties'])} tie points")
+        for tie in arguments["ties"]:
+            add_point(model, tie)
+        if arguments["control"]:
+            adjust_with_control(model, arguments["control"], threads=task.threads)
+            drop_bad(model)
+        else:
+            adjust(model, threads=task.threads)
+    counts = f"{len(arguments['ties'])} tie points and {len(arguments['control'])} control points"
+    task.remarks.append(f"adjusted with {counts}")
     return task.finish(model)
 
 
@@ -237,15 +246,3 @@ def _max_change(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> flo
         if str((image := model.images[i]).name) in poses
     ]
     return float(max(changes, default=0.0))
-
-
-def _add_ties(model: pycolmap.Reconstruction, ties: Sequence[Mapping[str, Any]]) -> None:
-    """Add tie points with their clicks as observations."""
-    ids = {str(image.name): i for i, image in model.images.items()}
-    for tie in ties:
-        track = pycolmap.Track()
-        for name, x, y in tie["clicks"]:
-            points2D = model.images[ids[name]].points2D
-            points2D.append(pycolmap.Point2D(np.array([x, y], np.float64)))
-            track.add_element(ids[name], len(points2D) - 1)
-        model.add_point3D(np.array(tie["xyz"], np.float64), track, TIE_COLOR)

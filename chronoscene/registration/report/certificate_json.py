@@ -179,10 +179,12 @@ def to_json(
             | {
                 "check_points": _rmse(position.check),
                 "control_points": _rmse(position.control),
+                "control_points_left_out": _rmse(position.left_out),
                 "cameras_against_gps": _rmse(position.gps),
                 "ground_pixel": position.ground_pixel,
             },
             "route": certificate.route,
+            "features": certificate.features,
             "unit": certificate.unit,
             "extent": certificate.extent,
             "focal_px": certificate.focal,
@@ -215,6 +217,7 @@ def to_json(
                 "remarks": ties.remarks,
                 "points": [asdict(r) for r in ties.residuals],
             },
+            "resection": None if certificate.resection is None else asdict(certificate.resection),
             "thresholds": [{"key": key} | asdict(t) for key, t in THRESHOLDS.items()],
             "position_thresholds": [
                 {"key": key} | asdict(t) for key, t in POSITION_THRESHOLDS.items()

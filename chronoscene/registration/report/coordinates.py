@@ -10,11 +10,13 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from chronoscene.arrays import Array
@@ -22,26 +24,61 @@ from chronoscene.geodesy import Georeference, ReferenceSystem
 from chronoscene.io.staging import replacing, write_text_atomic
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import PointResidual
+from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 
 GEOREFERENCE = "georeference.json"
 CAMERAS = "cameras.csv"
 POINTS = "points.ply"
+POINTS_LAZ = "points.laz"
 CONTROL = "control.csv"
 
 DECIMALS = 4
 """Decimals of coordinates in metres: a tenth of a millimetre."""
 
 
-def write_coordinates(folder: Path, model: Registered, output: ReferenceSystem | None) -> None:
-    """Write ``georeference.json`` and, in a reference system, ``cameras.csv`` and ``points.ply``.
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Images and points in a local frame."""
+
+    names: Sequence[str]
+    labels: Sequence[str]
+    """Period of each image."""
+    cam_from_world: Array
+    points: Array
+    colors: NDArray[np.uint8]
+
+
+def placed_scene(scene: Scene) -> Placed:
+    """Images and points of a scene."""
+    return Placed(
+        names=[f.name for f in scene.frames],
+        labels=[scene.periods[f.period].label for f in scene.frames],
+        cam_from_world=np.stack([f.cam_from_world for f in scene.frames]),
+        points=scene.points.xyz,
+        colors=scene.points.rgb,
+    )
+
+
+def placed_model(model: Registered) -> Placed:
+    """Images and points of a registration."""
+    labels = [model.labels[p] for p in model.periods]
+    return Placed(model.names, labels, model.cam_from_world, model.points, model.colors)
+
+
+def write_coordinates(
+    folder: Path, model: Placed, frame: Georeference | None, output: ReferenceSystem | None
+) -> None:
+    """Write ``georeference.json`` and, in a reference system, tables of cameras and points.
+
+    These are ``cameras.csv``, ``points.ply`` and, where laspy is installed, ``points.laz``.
 
     Args:
         folder: An existing folder.
-        model: Nothing is written if it is not georeferenced.
+        model: Images and points.
+        frame: Local frame of these; nothing is written if it is unknown.
         output: Projected reference system.
     """
-    frame = model.georeference
     if frame is None:
         return
     record = asdict(frame) | {"crs": frame.crs}
@@ -52,7 +89,7 @@ def write_coordinates(folder: Path, model: Registered, output: ReferenceSystem |
     write_text_atomic(folder / GEOREFERENCE, json.dumps(record, indent=1) + "\n")
 
 
-def _linear(model: Registered, frame: Georeference, output: ReferenceSystem) -> dict[str, Any]:
+def _linear(model: Placed, frame: Georeference, output: ReferenceSystem) -> dict[str, Any]:
     """Linear approximation of the reference system around the middle of the cameras.
 
     Coordinates are ``offset + matrix @ world``, up to ``largest_error`` metres at any camera or
@@ -72,20 +109,18 @@ def _linear(model: Registered, frame: Georeference, output: ReferenceSystem) -> 
     }
 
 
-def _write_cameras(
-    path: Path, model: Registered, frame: Georeference, output: ReferenceSystem
-) -> None:
+def _write_cameras(path: Path, model: Placed, frame: Georeference, output: ReferenceSystem) -> None:
     centres = camera_centre(model.cam_from_world)
     places = output.from_local(frame, centres)
     axes = output.derivative(frame, centres)
     angles = omega_phi_kappa(model.cam_from_world[:, :3, :3], axes)
-    rows = zip(model.names, model.periods, places, angles, strict=True)
+    rows = zip(model.names, model.labels, places, angles, strict=True)
     _write_table(
         path,
         ("image", "period", "E", "N", "h", "omega", "phi", "kappa"),
         (
-            (name, model.labels[period], *_metres(place), *(f"{a:.6f}" for a in angle))
-            for name, period, place, angle in rows
+            (name, label, *_metres(place), *(f"{a:.6f}" for a in angle))
+            for name, label, place, angle in rows
         ),
     )
 
@@ -110,9 +145,7 @@ def omega_phi_kappa(rotations: Array, axes: Array) -> Array:
     return np.asarray(Rotation.from_matrix(turned).as_euler("XYZ", degrees=True), np.float64)
 
 
-def _write_points(
-    path: Path, model: Registered, frame: Georeference, output: ReferenceSystem
-) -> None:
+def _write_points(path: Path, model: Placed, frame: Georeference, output: ReferenceSystem) -> None:
     """Write coordinates of 64 bits: those of 32 bits are exact to half a metre only."""
     kinds = [(axis, "f8") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")]
     rows = np.empty(len(model.points), kinds)
@@ -123,6 +156,28 @@ def _write_points(
     data = PlyData([PlyElement.describe(rows, "vertex")], comments=[f"crs {output.text}"])
     with replacing(path) as partial:
         data.write(str(partial))
+    if find_spec("laspy") is not None and len(places):
+        _write_laz(path.with_name(POINTS_LAZ), places, model.colors, output)
+
+
+def _write_laz(
+    path: Path, places: Array, colors: NDArray[np.uint8], output: ReferenceSystem
+) -> None:
+    """Write points as compressed LAS 1.4."""
+    import laspy
+    from pyproj import CRS
+
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales = np.full(3, 0.1**DECIMALS)
+    header.offsets = np.floor(places.min(axis=0))
+    header.add_crs(CRS.from_user_input(output.text))
+    points = laspy.LasData(header)
+    points.xyz = places
+    points.red, points.green, points.blue = colors.astype(np.uint16).T * 257
+    data = io.BytesIO()
+    points.write(data, do_compress=True)
+    with replacing(path) as partial:
+        partial.write_bytes(data.getbuffer())
 
 
 def write_control(path: Path, points: Sequence[PointResidual]) -> None:

@@ -222,6 +222,7 @@ def with_errors(
     known: Mapping[str, Array],
     used: set[str],
     convert: Callable[[Array], Array],
+    unit: float = 1.0,
 ) -> Iterator[PointResidual]:
     """Residuals with roles, and with the errors of surveyed points.
 
@@ -231,6 +232,7 @@ def with_errors(
         known: Surveyed coordinates in the frame of the model.
         used: Names of the control that the model was moved to.
         convert: Coordinates of the model to those of the output. [N, 3] -> [N, 3]
+        unit: Metres in a unit of the output.
     """
     roles = {p.name: p.role for p in tie_points.points}
     for one in found:
@@ -239,7 +241,7 @@ def with_errors(
             surveyed = convert(known[one.name][None])[0]
             role = replace(role, surveyed=_place(surveyed))
             if one.place is not None:
-                error = convert(np.array([one.place]))[0] - surveyed
+                error = unit * (convert(np.array([one.place]))[0] - surveyed)
                 role = replace(role, error=_place(error))
         yield role
 

@@ -8,7 +8,7 @@ fit are named.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -19,6 +19,13 @@ from chronoscene.errors import SceneError
 from chronoscene.geodesy import Georeference, ReferenceSystem
 from chronoscene.registration.quality.rays import model_rays, place
 from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.control import (
+    CONTRADICTION,
+    contradictions,
+    control_arguments,
+    fit_control,
+    keep_positions,
+)
 from chronoscene.registration.ties.residuals import (
     Clicks,
     PointResidual,
@@ -65,6 +72,7 @@ def align_with_tie_points(
     *,
     mode: Mode = "auto",
     output: ReferenceSystem | None = None,
+    adjusted: Collection[str] | None = None,
 ) -> TieAlignment:
     """Check a registration by tie points and, where it fails, align its periods by them.
 
@@ -76,6 +84,7 @@ def align_with_tie_points(
         mode: ``check`` only moves the whole model to ground control; ``replace`` also aligns all
             periods again; ``auto`` does so if the points do not fit.
         output: Reference system of the errors; None for the frame of the model.
+        adjusted: Control that the model was adjusted with: it is not moved again. None if not.
 
     Raises:
         SceneError: If periods must be aligned and the points do not suffice.
@@ -92,7 +101,9 @@ def align_with_tie_points(
     frame = model.georeference or control_frame(tie_points)
     known = tie_points.located(frame)
     control = {name: known[name] for name in tie_points.names("control") & known.keys()}
-    there, used, more = _to_control(model, clicks, control)
+    there, used, more = model, set(adjusted or ()), list[str]()
+    if adjusted is None:
+        there, used, more = _to_control(model, clicks, control, tie_points)
     if used and model.georeference is None and tie_points.crs is not None:
         there = replace(there, georeference=frame, gps_enu=np.full_like(model.gps_enu, np.nan))
     if not used and model.georeference is None:
@@ -103,7 +114,9 @@ def align_with_tie_points(
             return xyz
         return output.from_local(there.georeference, xyz)
 
-    found = tuple(with_errors(residuals(there, every), tie_points, known, used, convert))
+    unit = 1.0 if output is None or there.georeference is None else output.unit
+
+    found = tuple(with_errors(residuals(there, every), tie_points, known, used, convert, unit))
     named = [r.name for r in found if r.outlier]
     remarks += more + ([f"outliers: {', '.join(named)}"] if named else [])
     return TieAlignment(
@@ -192,7 +205,7 @@ def move_periods(model: Registered, moves: dict[int, Sim3]) -> Registered:
 
 
 def _to_control(
-    model: Registered, clicks: Clicks, control: dict[str, Array]
+    model: Registered, clicks: Clicks, control: dict[str, Array], points: TiePoints
 ) -> tuple[Registered, set[str], list[str]]:
     """Move the whole model to ground control, if there is enough of it; the points used."""
     if not control:
@@ -201,7 +214,8 @@ def _to_control(
     known = [(i, clicks.names[t]) for i, t in enumerate(placed.track) if clicks.names[t] in control]
     source = placed.xyz[[i for i, _ in known]].reshape(-1, 3)
     target = np.array([control[name] for _, name in known]).reshape(-1, 3)
-    found = fit_few(source, target)
+    names, sigma = [name for _, name in known], points.sigmas()
+    found = fit_control(source, target, [sigma.get(name) for name in names])
     if found is None:
         remark = (
             f"{len(known)} control points can be placed; three that are not collinear are needed"
@@ -216,7 +230,9 @@ def _to_control(
         cam_from_world=move.apply_to_pose(model.cam_from_world),
     )
     kept = {name for (_, name), u in zip(known, used, strict=True) if u}
-    return there, kept, [f"moved to {len(kept)} control points{note}"]
+    against = contradictions(names, source, target) if used.all() else []
+    remarks = [f"moved to {len(kept)} control points{note}"]
+    return there, kept, remarks + [CONTRADICTION + c for c in against]
 
 
 def tie(
@@ -225,12 +241,16 @@ def tie(
     """Check a registration by tie points; align and adjust it by them where they do not fit."""
     mode: Mode = "replace" if model.unplaced else "auto"
     first = align_with_tie_points(model, points, mode=mode, output=output)
-    if not first.replaced:
+    if not first.replaced and not first.controlled:
         return first
-    adjusted = refine(refine_arguments(first.model, points))
-    adjusted = replace(adjusted, georeference=model.georeference, gps_enu=model.gps_enu)
-    last = align_with_tie_points(adjusted, points, mode="check", output=output)
-    return replace(last, replaced=True, remarks=(*first.remarks, *last.remarks))
+    used = {r.name for r in first.residuals if r.used}
+    arguments = refine_arguments(first.model, points, used)
+    adjusted = keep_positions(refine(arguments), first.model)
+    last = align_with_tie_points(
+        adjusted, points, mode="check", output=output, adjusted=used if used else None
+    )
+    remarks = (*first.remarks, *last.remarks)
+    return replace(last, replaced=first.replaced, remarks=tuple(dict.fromkeys(remarks)))
 
 
 def control_frame(points: TiePoints) -> Georeference | None:
@@ -250,9 +270,18 @@ def control_frame(points: TiePoints) -> Georeference | None:
     )
 
 
-def refine_arguments(model: Registered, points: TiePoints) -> dict[str, Any]:
-    """Poses, cameras and tie points of an aligned model, as arguments of `routes.refine`."""
-    tied = with_tie_tracks(model, points)
+def refine_arguments(
+    model: Registered, points: TiePoints, used: Collection[str] = ()
+) -> dict[str, Any]:
+    """Poses, cameras and tie points of an aligned model, as arguments of `routes.refine`.
+
+    Args:
+        model: The model.
+        points: The points.
+        used: Names of the control to adjust with.
+    """
+    ties_alone = tuple(p for p in points.points if p.name not in used)
+    tied = with_tie_tracks(model, replace(points, points=ties_alone))
     starts = tied.track_start[len(model.points) :].tolist()
     ties = []
     for xyz, first, last in zip(
@@ -266,4 +295,5 @@ def refine_arguments(model: Registered, points: TiePoints) -> dict[str, Any]:
         "poses": {name: pose[:3].tolist() for name, pose, _ in named},
         "cameras": {name: list(camera.params) for name, _, camera in named},
         "ties": ties,
+        "control": control_arguments(model, points, sorted(used)),
     }

@@ -1,17 +1,18 @@
 """Files of tie points and ground control that a person clicked.
 
 Two forms are read. A CSV has a row for each click: point id, image, x, y, and for surveyed points
-also their world coordinates and their role: control, or check. OpenDroneMap's ``gcp_list.txt`` has
-a line with the projection, then ``geo_x geo_y geo_z im_x im_y image_name [gcp_name]`` for each
-click; check points have names that start with ``CHK-``. Pixels are those of the
-photo as stored, without its orientation tag applied; the corner of the image is (0, 0).
+also their world coordinates, their role (control, or check) and the accuracy of the coordinates;
+a row may lack the click where a point was surveyed, but is seen in no photo. OpenDroneMap's
+``gcp_list.txt`` has a line with the projection, then ``geo_x geo_y geo_z im_x im_y image_name
+[gcp_name]`` for each click; check points have names that start with ``CHK-``. Pixels are those of
+the photo as stored, without its orientation tag applied; the corner of the image is (0, 0).
 """
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -32,12 +33,17 @@ COLUMNS = {
     "world y": ("world y", "world_y", "wy", "geo_y", "north", "latitude"),
     "world z": ("world z", "world_z", "wz", "geo_z", "up", "height", "altitude"),
     "role": ("role",),
+    "sigma x": ("sx", "sigma_x", "accuracy_x"),
+    "sigma y": ("sy", "sigma_y", "accuracy_y"),
+    "sigma z": ("sz", "sigma_z", "accuracy_z"),
 }
 """Names of columns, in lower case; upper-case X, Y, Z are world coordinates."""
 
 _TODO_CSV = "write lines such as: corner1,2016/IMG_0001.jpg,812.5,334.0"
 _TODO_ODM = "write lines such as: 544256.7 5320919.9 5.0 3044.5 2622.0 IMG_0525.jpg gcp01"
 
+
+Place = tuple[float, float, float]
 
 Role = Literal["tie", "control", "check"]
 """``control`` places the model in the world, ``check`` takes no part in the estimation, and ``tie``
@@ -65,9 +71,11 @@ class TiePoint:
 
     name: str
     clicks: tuple[Click, ...]
-    world: tuple[float, float, float] | None
+    world: Place | None
     """Surveyed coordinates, in the file's reference system."""
     role: Role
+    sigma: Place | None = None
+    """Stated standard deviations of ``world``, metres east, north and up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +91,10 @@ class TiePoints:
     def names(self, role: Role) -> set[str]:
         """Names of the points of a role."""
         return {p.name for p in self.points if p.role == role}
+
+    def sigmas(self) -> dict[str, Array]:
+        """Stated standard deviations, metres east, north and up. Name -> [3]"""
+        return {p.name: np.array(p.sigma) for p in self.points if p.sigma is not None}
 
     def located(self, frame: Georeference | None) -> dict[str, Array]:
         """Surveyed coordinates in a local frame; none if there is no frame. Name -> [3]
@@ -135,31 +147,45 @@ def read_tie_points(
         )
         crs = next((read_reference_system(f"{path}:{n}", text) for n, text in named), crs)
         rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")])
-    scaled = ((p, replace(c, x=scale * c.x, y=scale * c.y), w, r) for p, c, w, r in rows)
+    scaled = (
+        replace(r, click=replace(r.click, x=scale * r.click.x, y=scale * r.click.y)) for r in rows
+    )
     return _assemble(path, scaled, crs)
 
 
-_Row = tuple[str, Click, tuple[float, float, float] | None, Role | None]
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """One line of a file."""
+
+    point: str
+    click: Click
+    """Without a name of an image if the line has no click."""
+    world: Place | None
+    role: Role | None
+    sigma: Place | None = None
 
 
 def _assemble(path: Path, rows: Iterable[_Row], crs: ReferenceSystem | None) -> TiePoints:
     """Group clicks by point; refuse two places or two roles of one point."""
     clicks: dict[str, dict[str, Click]] = {}
-    worlds: dict[str, tuple[float, float, float]] = {}
+    worlds: dict[str, Place] = {}
+    sigmas: dict[str, Place] = {}
     roles: dict[str, Role] = {}
-    for name, click, world, role in rows:
+    moved: dict[str, int] = {}
+    for row in rows:
+        name, click, world, role = row.point, row.click, row.world, row.role
         mine = clicks.setdefault(name, {})
+        if row.sigma is not None:
+            sigmas[name] = row.sigma
         if click.image in mine:
             raise _wrong(
                 path, click.line, f"one click of point {name!r} in {click.image}",
                 f"another one on line {mine[click.image].line}", "remove one of the two lines",
             )  # fmt: skip
-        mine[click.image] = click
+        if click.image:
+            mine[click.image] = click
         if world is not None and worlds.setdefault(name, world) != world:
-            raise _wrong(
-                path, click.line, f"the same world coordinates of point {name!r} on all its lines",
-                f"{world} after {worlds[name]}", "correct them, or give the points two names",
-            )  # fmt: skip
+            moved.setdefault(name, click.line)
         if role is not None and name not in worlds:
             raise _wrong(
                 path, click.line, f"world coordinates of the {role} point {name!r}", "none",
@@ -170,12 +196,19 @@ def _assemble(path: Path, rows: Iterable[_Row], crs: ReferenceSystem | None) -> 
                 path, click.line, f"the same role of point {name!r} on all its lines",
                 f"{role} after {roles[name]}", "correct one of them",
             )  # fmt: skip
+    if moved:
+        named = ", ".join(f"{name} (line {line})" for name, line in moved.items())
+        raise _wrong(
+            path, min(moved.values()), "the same world coordinates on all lines of a point",
+            f"other ones for {named}", "correct them, or give the points two names",
+        )  # fmt: skip
     points = tuple(
         TiePoint(
             name,
             tuple(mine.values()),
             worlds.get(name),
             roles.get(name, "control" if name in worlds else "tie"),
+            sigmas.get(name),
         )
         for name, mine in sorted(clicks.items())
     )
@@ -188,8 +221,7 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
     cells = [(n, [c.strip() for c in next(csv.reader([line]))]) for n, line in lines]
     order = _header(path, *cells[0]) if cells else None
     if order is None:
-        names = ("point", "image", "x", "y", "world x", "world y", "world z", "role")
-        order = {name: i for i, name in enumerate(names)}
+        order = {name: i for i, name in enumerate(COLUMNS)}
     else:
         cells = cells[1:]
     for number, row in cells:
@@ -197,22 +229,32 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
             found = f"{len(row)} fields"
             raise _wrong(path, number, "point id, image, x, y", found, _TODO_CSV)
         point, image = row[order["point"]], row[order["image"]]
-        if not point or not image:
-            raise _wrong(path, number, "a point id and an image", f"{row[:4]}", _TODO_CSV)
-        xy = [_number(path, number, row[order[name]], name) for name in ("x", "y")]
         cell = {name: row[i] for name, i in order.items() if i < len(row)}
-        world = [cell[name] for name in ("world x", "world y", "world z") if cell.get(name)]
-        if len(world) not in (0, 3):
+        world = _three(path, number, cell, "world", "world coordinates")
+        unseen = world is not None and not any(cell[k] for k in ("image", "x", "y"))
+        if not point or not (image or unseen):
+            raise _wrong(path, number, "a point id and an image", f"{row[:4]}", _TODO_CSV)
+        xy = [0.0 if unseen else _number(path, number, cell[name], name) for name in ("x", "y")]
+        sigma = _three(path, number, cell, "sigma", "accuracies")
+        if sigma is not None and min(sigma) <= 0:
             raise _wrong(
-                path, number, "three world coordinates, or none", f"{len(world)}", _TODO_CSV
+                path, number, "accuracies above 0, in metres", f"{sigma}", "leave unknown ones out"
             )
-        xyz = [_number(path, number, text, "a world coordinate") for text in world]
-        yield (
-            point,
-            Click(image, xy[0], xy[1], line=number),
-            (xyz[0], xyz[1], xyz[2]) if xyz else None,
-            _role(path, number, cell.get("role", "")),
-        )
+        role = _role(path, number, cell.get("role", ""))
+        yield _Row(point, Click(image, xy[0], xy[1], line=number), world, role, sigma)
+
+
+def _three(
+    path: Path, number: int, cell: Mapping[str, str], prefix: str, what: str
+) -> Place | None:
+    """Numbers in three columns; None if all of them are empty."""
+    texts = [cell[f"{prefix} {axis}"] for axis in "xyz" if cell.get(f"{prefix} {axis}")]
+    if not texts:
+        return None
+    if len(texts) != 3:
+        raise _wrong(path, number, f"three {what}, or none", f"{len(texts)}", _TODO_CSV)
+    x, y, z = (_number(path, number, text, f"one of the {what}") for text in texts)
+    return x, y, z
 
 
 def _role(path: Path, number: int, text: str) -> Role | None:
@@ -262,7 +304,7 @@ def _odm_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
         # Without a name, a point is known by where it is.
         point = fields[6] if len(fields) > 6 and fields[6] else f"{fields[0]} {fields[1]}"
         role: Role = "check" if point.startswith(CHECK_PREFIX) else "control"
-        yield point, Click(fields[5], u, v, line=number), (x, y, z), role
+        yield _Row(point, Click(fields[5], u, v, line=number), (x, y, z), role)
 
 
 def _projection(path: Path, line: str) -> ReferenceSystem:
@@ -297,8 +339,8 @@ def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int |
                 "write the name with its folder",
             )  # fmt: skip
         found[click.image] = index.get(plain, index[ends[0]] if ends else None)
-    if all(i is None for i in found.values()):
-        first = tie_points.points[0].clicks[0]
+    if found and all(i is None for i in found.values()):
+        first = next(c for p in tie_points.points for c in p.clicks)
         raise _wrong(
             tie_points.path, first.line, "images that are registered, such as "
             f"{names[0] if names else '(there are none)'}", first.image, "correct the names",

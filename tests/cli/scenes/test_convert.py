@@ -1,13 +1,19 @@
 """chronoscene convert: what it prints and how it fails."""
 
+import csv
+import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import cli, main
+from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
+from chronoscene.geodesy import Georeference, read_reference_system
+from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.splits import split_hash
 
 
@@ -52,6 +58,24 @@ def test_options_of_the_source(make_scene_folder, tmp_path):
     result = run(folder, tmp_path / "out", *options)
     assert "  period 1 (2023): 0 train, 1 test" in result.stdout
     assert [p.date for p in read_scene(tmp_path / "out").periods] == ["2016", "2023"]
+
+
+def test_coordinates_in_a_reference_system(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    with pytest.raises(ConfigError, match="expected a georeferenced scene"):
+        run(folder, tmp_path / "none", "--crs", "EPSG:32632")
+    frame = Georeference(51.0, 11.0, 200.0, "as stated")
+    world = {"unit": "metre", "crs": frame.crs, "offset": [0.0, 0.0, 0.0]}
+    (folder / "sparse/world.json").write_text(json.dumps(world))
+    assert run(folder, tmp_path / "out", "--crs", "EPSG:32632").exit_code == 0
+    rows = list(csv.DictReader((tmp_path / "out/cameras.csv").open()))
+    scene = read_scene(folder)
+    assert [r["image"] for r in rows] == [f.name for f in scene.frames]
+    places = np.array([[float(r[c]) for c in "ENh"] for r in rows])
+    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    utm = read_reference_system("", "EPSG:32632")
+    np.testing.assert_allclose(utm.to_local(frame, places), centres, atol=1e-3)
+    assert (tmp_path / "out/points.ply").is_file()
 
 
 def test_help_lists_formats_and_groupings():

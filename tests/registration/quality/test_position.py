@@ -19,7 +19,11 @@ from chronoscene.arrays import Array
 from chronoscene.geodesy import Georeference, read_reference_system
 from chronoscene.registration.output import Inspection, inspect_registration
 from chronoscene.registration.quality.position import Position, judge_position
-from chronoscene.registration.report.coordinates import omega_phi_kappa, write_coordinates
+from chronoscene.registration.report.coordinates import (
+    omega_phi_kappa,
+    placed_model,
+    write_coordinates,
+)
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, align_with_tie_points
 from chronoscene.registration.ties.tie_points import read_tie_points
@@ -126,6 +130,16 @@ def test_a_wrong_control_point_is_named_and_left_out(tmp_path: Path, made: Gener
     assert position.control is not None and position.control.horizontal < 0.2
 
 
+def test_a_wrong_one_of_five_control_points_is_named(tmp_path: Path, made: Generated) -> None:
+    """Too few to leave it out, but enough to tell which it is."""
+    file = survey(tmp_path / "s.csv", made, off={3: (6.0, 0.0, 0.0)}, points=5)
+    _, position = judged(made.model, file)
+    named = [o for o in position.objections if o.check == "contradiction"]
+    assert len(named) == 1 and "c3 is " in named[0].found
+    good = survey(tmp_path / "t.csv", made, points=5)
+    assert not [o for o in judged(made.model, good)[1].objections if o.check == "contradiction"]
+
+
 def test_check_points_only_measure(tmp_path: Path, made: Generated) -> None:
     file = survey(tmp_path / "s.csv", made, checks=range(8))
     ties, position = judged(made.model, file)
@@ -194,7 +208,8 @@ def test_cameras_and_points_come_in_the_reference_system(
     far: tuple[TieAlignment, float], made: Generated, tmp_path: Path
 ) -> None:
     ties, size = far
-    write_coordinates(tmp_path, ties.model, UTM)
+    model = placed_model(ties.model)
+    write_coordinates(tmp_path, model, ties.model.georeference, UTM)
     with (tmp_path / "cameras.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [r["image"] for r in rows] == list(made.model.names)
@@ -215,6 +230,10 @@ def test_cameras_and_points_come_in_the_reference_system(
     assert points.dtype == np.float64
     np.testing.assert_allclose(UTM.to_local(ties.model.georeference, points), ties.model.points,
                                atol=1e-6)  # fmt: skip
+    laspy = pytest.importorskip("laspy")
+    cloud = laspy.read(tmp_path / "points.laz")
+    np.testing.assert_allclose(cloud.xyz, points, atol=1e-4)
+    assert cloud.header.parse_crs() == pyproj.CRS("EPSG:32632")
     data = json.loads((tmp_path / "georeference.json").read_text())
     linear = data["output"]
     world = camera_centre(ties.model.cam_from_world)

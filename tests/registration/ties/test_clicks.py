@@ -20,7 +20,7 @@ from chronoscene.registration.pipeline import run
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.models import known_images
 from chronoscene.registration.result import Registered
-from chronoscene.registration.ties.tie_alignment import tie
+from chronoscene.registration.ties.tie_alignment import TieAlignment, align_with_tie_points, tie
 from chronoscene.registration.ties.tie_points import read_tie_points
 from chronoscene.registration.work_folder import Stages, work_folder
 from chronoscene.scene import Scene
@@ -117,28 +117,24 @@ def test_clicks_replace_an_alignment_that_failed(
     assert_placed_by_clicks(model, {name: known[Path(name).name] for name in model.names})
 
 
-def write_projections(case: Any, path: Path, count: int) -> None:
+def write_projections(case: Any, path: Path, count: int, *, control: bool = False) -> None:
     """Points near the middle of a case, each clicked in three images of either period."""
     rng = np.random.default_rng(4)
     model = known_images(case.database)  # its cameras end with it
     cameras = {str(i.name): i.camera for i in model.images.values()}
-    lines = ["point,image,x,y\n"]
+    lines = ["point,image,x,y" + ",X,Y,Z,sX,sY,sZ" * control + "\n"]
     for i, xyz in enumerate(rng.uniform(-1, 1, (count, 3))):
+        world = "".join(f",{v:.5f}" for v in xyz) + 3 * ",0.001" if control else ""
         for period in (0, 1):
             for name in [n for n, p in sorted(case.periods.items()) if p == period][i % 2 :: 3]:
                 local = case.truth[name][:3, :3] @ xyz + case.truth[name][:3, 3]
                 x, y = cameras[name].img_from_cam(local) + rng.normal(0, CLICK_PIXELS, 2)
-                lines.append(f"p{i},{name},{x:.2f},{y:.2f}\n")
+                lines.append(f"p{i},{name},{x:.2f},{y:.2f}{world}\n")
     path.write_text("".join(lines))
 
 
-def test_clicks_place_a_period_that_nothing_matches(
-    make_case: Callable[..., Any], tmp_path: Path
-) -> None:
-    """The same on given matches instead of photos: all that comes after matching, in seconds."""
-    case = make_case(cross_matches=0.0)
-    clicks = tmp_path / "clicks.csv"
-    write_projections(case, clicks, 12)
+def tied(case: Any, clicks: Path) -> tuple[Registered, TieAlignment]:
+    """All that comes after matching, on given matches instead of photos: before and after ties."""
     inputs = PhotoInputs(
         captures=Captures(case.folder, (), (), (), ()), scene=None, images=(), periods=case.periods,
         labels=LABELS, dates=LABELS, refused={}, positions=locate(()), georeference=None,
@@ -157,6 +153,16 @@ def test_clicks_place_a_period_that_nothing_matches(
             read_tie_points(clicks),
             lambda arguments: refined(first, arguments, inputs, context),
         )
+    return first, result
+
+
+def test_clicks_place_a_period_that_nothing_matches(
+    make_case: Callable[..., Any], tmp_path: Path
+) -> None:
+    case = make_case(cross_matches=0.0)
+    clicks = tmp_path / "clicks.csv"
+    write_projections(case, clicks, 12)
+    first, result = tied(case, clicks)
     assert len({case.periods[name] for name in first.unplaced}) == 1
     model = result.model
     assert result.replaced and len(model.names) == len(case.truth)
@@ -165,3 +171,22 @@ def test_clicks_place_a_period_that_nothing_matches(
     )
     assert (linking == 2).sum() == 12  # the adjustment had the clicked points
     assert_placed_by_clicks(model, case.truth)
+
+
+def test_control_is_adjusted_with(make_case: Callable[..., Any], tmp_path: Path) -> None:
+    """Cameras lie where they are in the world, nearer than the similarity alone puts them."""
+    case = make_case(points=100, noise=1.0)
+    clicks = tmp_path / "control.csv"
+    write_projections(case, clicks, 8, control=True)
+    first, result = tied(case, clicks)
+    assert result.controlled and not result.replaced
+    moved = align_with_tie_points(first, read_tie_points(clicks)).model
+
+    def error(model: Registered) -> float:
+        truth = np.stack([case.truth[name] for name in model.names])
+        gaps = camera_centre(model.cam_from_world) - camera_centre(truth)
+        return float(np.sqrt(np.mean(gaps**2)))
+
+    assert error(result.model) < 0.8 * error(moved)
+    assert all(r.used and r.error is not None for r in result.residuals)
+    assert any("8 control points" in remark for remark in result.remarks)

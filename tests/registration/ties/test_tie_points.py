@@ -298,3 +298,30 @@ def test_points_that_no_two_periods_share_do_not_move_them(tmp_path: Path) -> No
     of = [r for r in rows[1:] if (",t0/" in r) == (int(r[1]) % 2 == 0)]
     found = align_with_tie_points(made.model, read(tmp_path, "\n".join([rows[0], *of])))
     assert not found.replaced and found.controlled
+
+
+def test_accuracies_and_points_that_no_photo_shows(tmp_path: Path) -> None:
+    points = read(
+        tmp_path,
+        "point,image,x,y,X,Y,Z,role,sX,sY,sZ\n"
+        "a,1.jpg,10,20,1,2,3,,0.01,0.02,0.05\n"
+        "b,,,,4,5,6,check,,,\n"
+        "c,1.jpg,30,20,,,,,,,\n",
+    )
+    found = {p.name: p for p in points.points}
+    assert found["a"].sigma == (0.01, 0.02, 0.05) and found["b"].sigma is None
+    assert list(points.sigmas()) == ["a"]
+    assert found["b"].clicks == () and found["b"].role == "check"
+    for row, message in (
+        ("a,1.jpg,1,2,1,2,3,,0.1,,", "three accuracies"),
+        ("a,1.jpg,1,2,1,2,3,,0,1,1", "accuracies above 0"),
+        ("a,,,,,,,", "a point id and an image"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            read(tmp_path, f"point,image,x,y,X,Y,Z,role,sX,sY,sZ\n{row}\n")
+
+
+def test_all_points_with_two_places_are_named(tmp_path: Path) -> None:
+    rows = ["a,1.jpg,1,2,1,2,3", "a,2.jpg,1,2,1,2,4", "b,1.jpg,5,2,1,2,3", "b,2.jpg,1,2,0,2,3"]
+    with pytest.raises(SceneError, match=r"a \(line 3\), b \(line 5\)"):
+        read(tmp_path, "point,image,x,y,X,Y,Z\n" + "\n".join(rows))

@@ -1,0 +1,78 @@
+"""``chronoscene mark``: a page on which tie and control points are marked in photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE
+from chronoscene.cli.output import check_place, emit
+from chronoscene.cli.progress import progress_bar
+from chronoscene.errors import ConfigError
+from chronoscene.geodesy import read_reference_system
+from chronoscene.io.staging import check_outside, write_text_atomic
+from chronoscene.registration.photos.captures import find_captures, read_captures
+from chronoscene.registration.report.marking import marking_page
+from chronoscene.registration.ties.tie_points import read_tie_points
+
+
+@click.command("mark")
+@click.argument("captures", type=PATH)
+@click.argument("page", type=PATH)
+@TABLE
+@click.option(
+    "--tie-points",
+    type=EXISTING_FILE,
+    help="Points to start with, as register reads them; rows with a name and world coordinates "
+    "only are points to be marked.",
+)
+@click.option(
+    "--tie-scale",
+    type=click.FloatRange(0, min_open=True),
+    default=1.0,
+    help="Size of these photos divided by that of the photos that its points were clicked in.",
+)
+@click.option("--crs", help="Reference system of their coordinates, if the file names none.")
+@click.option(
+    "--model",
+    type=PATH,
+    help="COLMAP model of these photos, such as OUT.work/model-joint of register: the page then "
+    "shows epipolar lines and predicted places.",
+)
+@click.option(
+    "--max-size",
+    type=click.IntRange(200, 8000),
+    default=1600,
+    help="Pixels of the longer side of the photos in the page.",
+)
+def command(
+    captures: Path,
+    page: Path,
+    table: Path | None,
+    tie_points: Path | None,
+    tie_scale: float,
+    crs: str | None,
+    model: Path | None,
+    max_size: int,
+) -> None:
+    """Make a page to mark points in photos.
+
+    CAPTURES is what register reads. PAGE is one HTML file with the photos in it: open it in a
+    browser, mark points, and save points.csv, which register reads by --tie-points. Coordinates are
+    in pixels of the original photos.
+    """
+    folder, table = find_captures(captures, table)
+    check_outside(page, [folder], option="PAGE")
+    check_place("PAGE", page.absolute().parent)
+    system = None if crs is None else read_reference_system("--crs", crs, error=ConfigError)
+    points = None
+    if tie_points is not None:
+        points = read_tie_points(tie_points, scale=tie_scale, crs=system)
+    with progress_bar(f"read {captures}") as report:
+        found = read_captures(folder, table=table).images
+        text = marking_page(
+            found, points=points, model=model, max_size=max_size, title=page.stem, report=report
+        )
+    write_text_atomic(page, text)
+    emit(f"{page}: {len(found)} photos, {len(text) / 1e6:.1f} MB; open it in a browser\n", None)

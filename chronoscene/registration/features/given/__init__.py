@@ -1,0 +1,1 @@
+"""Features and matches that the user has: files of hloc and COLMAP, and extractors of others."""

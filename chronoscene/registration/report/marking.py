@@ -1,0 +1,119 @@
+"""A page on which a person marks tie and control points in photos; it needs no server.
+
+Photos are embedded at a reduced size, and marks are in pixels of the originals, as stored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chronoscene.colmap.model import Model, PosedImage, read_model
+from chronoscene.images.decoding import load_photo
+from chronoscene.io.pages import data_uri, render_page
+from chronoscene.io.processes import Report
+from chronoscene.registration.photos.inputs import plain_names
+from chronoscene.registration.photos.photo import Capture
+from chronoscene.registration.ties.tie_points import TiePoints, match_images
+from chronoscene.scene.cameras import CAMERA_MODELS, PINHOLE_MODELS, POLYNOMIAL_MODELS
+from chronoscene.scene.geometry import camera_centre
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Order of the parameters on the page: that of OpenCV."""
+
+DEPTHS = (0.1, 5.0)
+"""Range of an epipolar line, as a share of the nearest and the farthest usual depth of points."""
+
+
+def marking_page(
+    captures: Sequence[Capture],
+    *,
+    points: TiePoints | None = None,
+    model: Path | None = None,
+    max_size: int = 1600,
+    title: str = "Points",
+    file: str = "points.csv",
+    report: Report | None = None,
+) -> str:
+    """Render the page.
+
+    Args:
+        captures: The photos.
+        points: Points to start with; clicks in other photos are dropped.
+        model: Folder of a COLMAP model of these photos, by which places are predicted.
+        max_size: Pixels of the longer side of an embedded photo.
+        title: Of the page.
+        file: Name of the file that it saves.
+        report: Called with the progress.
+    """
+    found = None if model is None else read_model(model)
+    posed = {} if found is None else {image.name: image for image in found.images}
+    names = [c.name for c in captures]
+    photos = []
+    for i, (capture, name) in enumerate(zip(captures, plain_names(names), strict=True)):
+        if report is not None:
+            report("photos", i, len(captures))
+        image = posed.get(name) or posed.get(f"{name}.png")
+        photos.append(_photo(capture, image, max_size))
+    state = {"points": [] if points is None else _points(points, names)}
+    data = {
+        "photos": photos,
+        "state": state,
+        "depths": (1.0, 100.0) if found is None else _depths(found),
+        "crs": points.crs.text if points is not None and points.crs is not None else "",
+        "file": file,
+        "key": hashlib.sha256("\n".join([title, *names]).encode()).hexdigest()[:12],
+    }
+    return render_page("marking/page", title=title, file=file, data=data)
+
+
+def _photo(capture: Capture, image: PosedImage | None, max_size: int) -> dict[str, Any]:
+    from PIL import Image
+
+    picture = Image.fromarray(load_photo(capture.path)[0])
+    picture.thumbnail((max_size, max_size), Image.Resampling.LANCZOS)
+    camera = None
+    if image is not None and image.camera.model in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS):
+        named = CAMERA_MODELS[image.camera.model].distortion
+        values = dict(zip(named, image.camera.distortion, strict=True))
+        K = image.camera.K
+        camera = {
+            "pose": image.cam_from_world[:3].tolist(),
+            "intrinsics": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+            "distortion": [values.get(name, 0.0) for name in DISTORTION],
+        }
+    return {
+        "name": capture.name,
+        "width": capture.width,
+        "height": capture.height,
+        "shown": picture.width,
+        "src": data_uri(picture),
+        "camera": camera,
+    }
+
+
+def _points(points: TiePoints, names: Sequence[str]) -> list[dict[str, Any]]:
+    index = match_images(points, names)
+    return [
+        {
+            "name": p.name,
+            "role": p.role,
+            "world": "" if p.world is None else " ".join(map(repr, p.world)),
+            "sigma": "" if p.sigma is None else " ".join(map(repr, p.sigma)),
+            "marks": {names[i]: [c.x, c.y] for c in p.clicks if (i := index[c.image]) is not None},
+        }
+        for p in points.points
+    ]
+
+
+def _depths(model: Model) -> tuple[float, float]:
+    """Distances from a camera between which points of a photo lie."""
+    poses = np.stack([image.cam_from_world for image in model.images])
+    points = model.points.xyz if len(model.points) else camera_centre(poses)
+    depth = poses[:, 2, :3] @ points.T + poses[:, 2, 3:]
+    near, far = np.quantile(depth[depth > 0], [0.05, 0.95]) if (depth > 0).any() else (1.0, 100.0)
+    return float(DEPTHS[0] * near), float(DEPTHS[1] * far)

@@ -1,0 +1,189 @@
+"""The page to mark points: what is in it, and in Chromium, by mouse, keyboard and touch."""
+
+import csv
+import itertools
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from chronoscene.cli.scenes.mark import command
+from chronoscene.colmap.model import write_model
+from chronoscene.registration.photos.captures import read_captures
+from chronoscene.registration.report.marking import marking_page
+from chronoscene.registration.ties.tie_points import read_tie_points
+from chronoscene.scene import Scene
+from chronoscene.scene.cameras import project_points
+
+NAMES = ("2016/p0_0000.jpg", "2016/p0_0001.jpg", "2023/p1_0000.jpg")
+
+
+@pytest.fixture(scope="module")
+def captures(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("marking") / "captures"
+    for name in NAMES:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        frame = next(f for f in truth.frames if f.name == Path(name).name)
+        (root / name).symlink_to(truth.image_path(frame))
+    return root
+
+
+@pytest.fixture(scope="module")
+def model(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The true poses as a COLMAP model, under the names of the captures."""
+    from dataclasses import replace
+
+    folder = tmp_path_factory.mktemp("model")
+    known = {Path(name).name: name for name in NAMES}
+    frames = [replace(f, name=known.get(f.name, f.name)) for f in truth.frames]
+    write_model(folder, frames, truth.points)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(captures: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("page")
+    points = folder / "points.csv"
+    points.write_text(
+        "# crs: EPSG:32632\npoint,image,x,y,X,Y,Z,role\n"
+        f"</script><b>,{NAMES[0]},100,50,500000.5,5320000.25,12.125,check\n"
+        "unseen,,,,500010,5320000,12,\n"
+    )
+    found = read_captures(captures).images
+    text = marking_page(found, points=read_tie_points(points), model=model, max_size=200)
+    (folder / "page.html").write_text(text)
+    return folder / "page.html"
+
+
+def test_nothing_is_loaded_and_names_are_escaped(page: Path) -> None:
+    text = page.read_text()
+    assert "default-src 'none'" in text
+    assert "http://" not in text and "https://" not in text
+    assert "</script><b>" not in text
+    assert text.count("data:image/jpeg") == len(NAMES)
+
+
+def test_the_command_writes_a_page(captures: Path, tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    done = CliRunner().invoke(command, [str(captures), str(tmp_path / "p.html")])
+    assert done.exit_code == 0, done.output
+    assert "3 photos" in done.output
+    assert (tmp_path / "p.html").stat().st_size > 10_000
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    program = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
+    if program is None:
+        pytest.skip("no Chromium here")
+    with api.sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+class Opened:
+    """The page in a browser."""
+
+    def __init__(self, browser: Any, page: Path, width: int, height: int) -> None:
+        self.context = browser.new_context(viewport={"width": width, "height": height})
+        self.tab = self.context.new_page()
+        self.errors: list[str] = []
+        self.tab.on("pageerror", lambda e: self.errors.append(str(e)))
+        self.tab.on("console", lambda m: self.errors.append(m.text))
+        self.open(page)
+
+    def open(self, page: Path) -> None:
+        self.tab.goto(f"file://{page}")
+        self.tab.wait_for_function("picture().complete && $('points').children.length")
+        self.tab.locator("#view").focus()
+
+    def mark(self, xy: Any) -> None:
+        """Click at pixels of the original photo."""
+        x, y = self.tab.evaluate("xy => toScreen(xy)", [float(v) for v in xy])
+        box = self.tab.locator("#view").bounding_box()
+        self.tab.mouse.click(box["x"] + x, box["y"] + y)
+
+    def saved(self, path: Path) -> list[dict[str, str]]:
+        with self.tab.expect_download() as download:
+            self.tab.keyboard.press("s")
+        download.value.save_as(path)
+        lines = [r for r in path.read_text().splitlines() if not r.startswith("#")]
+        return list(csv.DictReader(lines))
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_points_are_marked_by_mouse_and_keyboard(
+    browser: Any, page: Path, tmp_path: Path, width: int, height: int
+) -> None:
+    opened = Opened(browser, page, width, height)
+    tab = opened.tab
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    tab.keyboard.press("a")
+    tab.locator("#name").fill("door")
+    tab.locator("#name").press("Enter")
+    tab.locator("#view").focus()
+    opened.mark((200, 150))
+    box = tab.locator("#view").bounding_box()
+    tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    tab.mouse.wheel(0, -900)  # zoom: the same pixels are elsewhere on the screen
+    tab.wait_for_function("scale > 1.5 * view.clientWidth / 400")
+    opened.mark((210, 160))
+    tab.keyboard.press("Shift+ArrowLeft")
+    tab.keyboard.press("ArrowRight")
+    opened.mark((50, 60))
+    opened.mark((55, 66))
+    tab.keyboard.press("u")
+    tab.keyboard.press("ArrowRight")
+    opened.mark((5, 6))
+    tab.keyboard.press("Delete")
+    rows = opened.saved(tmp_path / "points.csv")
+    door = {r["image"]: (float(r["x"]), float(r["y"])) for r in rows if r["point"] == "door"}
+    assert door.keys() == {NAMES[0], NAMES[1]}
+    np.testing.assert_allclose(door[NAMES[0]], (209.75, 160), atol=0.6)
+    np.testing.assert_allclose(door[NAMES[1]], (50, 60), atol=1.5)
+    points = {p.name: p for p in read_tie_points(tmp_path / "points.csv").points}
+    assert points["door"].role == "tie" and len(points["door"].clicks) == 2
+    assert points["</script><b>"].world == (500000.5, 5320000.25, 12.125)
+    assert points["</script><b>"].role == "check" and not points["unseen"].clicks
+    assert opened.errors == []
+    opened.context.close()
+
+
+def test_unsaved_work_is_kept(browser: Any, page: Path) -> None:
+    opened = Opened(browser, page, 800, 600)
+    opened.mark((20, 30))
+    opened.tab.goto("about:blank")
+    opened.open(page)
+    assert "Unsaved work" in opened.tab.locator("#status").inner_text()
+    found = opened.tab.evaluate("state.points[0].marks")
+    np.testing.assert_allclose(found[NAMES[0]], (20, 30), atol=1)
+    opened.context.close()
+
+
+def test_a_mark_predicts_the_others(browser: Any, page: Path, truth: Scene) -> None:
+    """On an epipolar line by one mark, at the place by two."""
+    frames = {f.name: f for f in truth.frames}
+    xyz = truth.points.xyz[int(np.argmax(np.diff(truth.points.track_start)))]
+    pixels = [project_points(frames[Path(n).name].camera,
+              xyz[None] @ frames[Path(n).name].cam_from_world[:3, :3].T
+              + frames[Path(n).name].cam_from_world[:3, 3])[0] for n in NAMES]  # fmt: skip
+    opened = Opened(browser, page, 800, 600)
+    opened.tab.keyboard.press("a")
+    opened.tab.evaluate("xy => state.points[point].marks[photos[0].name] = xy", pixels[0].tolist())
+    line = opened.tab.evaluate("predict(photos[1]).line.filter(Boolean)")
+    gaps = [
+        abs((b[0] - a[0]) * (a[1] - pixels[1][1]) - (a[0] - pixels[1][0]) * (b[1] - a[1]))
+        / np.hypot(b[0] - a[0], b[1] - a[1])
+        for a, b in itertools.pairwise(line)
+    ]
+    assert min(gaps) < 0.5
+    opened.tab.evaluate("xy => state.points[point].marks[photos[1].name] = xy", pixels[1].tolist())
+    at = opened.tab.evaluate("predict(photos[2]).at")
+    np.testing.assert_allclose(at, pixels[2], atol=0.5)
+    opened.context.close()
