@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference
+from chronoscene.registration.photos.stated import Stated
 from chronoscene.scene import Camera
 
 Route = Literal["joint", "frozen", "separate"]
@@ -101,6 +102,12 @@ class Registered:
     held_out_tracks: HeldOutTracks
     images_root: str
     """Folder of the images: photos as ``cameras`` describe them."""
+    stated: Mapping[str, Stated] = field(default_factory=dict)
+    """What the metadata of photos state, by name."""
+    short: bool = False
+    """True if points of two images and of small angles count."""
+    held: bool = False
+    """True if focal lengths are those that photos state."""
     unplaced: frozenset[str] = frozenset()
     """Images of periods that are in a frame of their own, to be placed by tie points."""
 

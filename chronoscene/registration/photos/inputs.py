@@ -28,6 +28,7 @@ from chronoscene.registration.context import Context
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.gps_priors import Positions, locate
 from chronoscene.registration.photos.photo import Capture
+from chronoscene.registration.photos.stated import stated
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 
@@ -72,6 +73,11 @@ class PhotoInputs:
             "enu": {name: found.enu[i].tolist() for i, name in good},
             "sigma": {name: found.sigma[i].tolist() for i, name in good},
         }
+
+    def focals(self) -> dict[str, tuple[float, float]]:
+        """Focal length that each photo states, in pixels, and its relative error, by name."""
+        found = ((c.name, stated(c)) for c in self.images)
+        return {name: (s.focal, s.focal_error) for name, s in found if s.focal is not None}
 
     def centres(self) -> dict[str, list[float]]:
         """Known positions of images, in one frame, by name."""

@@ -20,6 +20,7 @@ from chronoscene.errors import RegistrationError
 from chronoscene.registration.context import Context
 from chronoscene.registration.features.correspondences import Matched
 from chronoscene.registration.photos.inputs import PhotoInputs
+from chronoscene.registration.photos.stated import stated
 from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered, Route
 from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
@@ -118,6 +119,7 @@ def _run_route(route: Route, inputs: PhotoInputs, matched: Matched, context: Con
     else:
         settings["priors"] = inputs.priors() if inputs.georeference else None
         settings["keep_unplaced"] = context.options.tie_points is not None
+        settings["focals"] = inputs.focals()
     result = _estimate(route, route, settings, context)
     registered = _assemble(route, route, result, inputs, context)
     missing = set(inputs.periods) - set(registered.names)
@@ -130,7 +132,8 @@ def refined(
     registered: Registered, arguments: Mapping[str, Any], inputs: PhotoInputs, context: Context
 ) -> Registered:
     """A registration adjusted again after tie points have moved its periods."""
-    result = _estimate("refine", "refined", dict(arguments), context)
+    settings = dict(arguments) | {"short": registered.short, "held": registered.held}
+    result = _estimate("refine", "refined", settings, context)
     again = _assemble(registered.route, "refined", result, inputs, context)
     lost = set(registered.names) - set(again.names)
     reason = "lost when the model was adjusted with tie points"
@@ -194,6 +197,9 @@ def _assemble(
         held_out=cross_matches(tracks, periods),
         held_out_tracks=tracks,
         images_root=str(context.photos),
+        stated={c.name: stated(c) for c in inputs.images},
+        short=result["short"],
+        held=result["held"],
     )
 
 

@@ -22,6 +22,7 @@ from chronoscene.registration.reconstruct.consistency import (
     deregister_misplaced,
     pair_agreements,
 )
+from chronoscene.registration.reconstruct.focal import hold_focals
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
 from chronoscene.registration.reconstruct.mapping import (
     Task,
@@ -49,13 +50,25 @@ def joint(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Map all images together; submodels that did not connect are merged afterwards.
 
     Arguments: ``database``, ``photos``, ``periods`` (by name), ``priors`` (``enu`` and ``sigma`` by
-    name, or null), ``keep_unplaced`` (see `submodels.combine`), ``out`` (model folder),
-    ``scratch``, ``threads``.
+    name, or null), ``focals`` (see `focal.Focals`), ``keep_unplaced`` (see `submodels.combine`),
+    ``out`` (model folder), ``scratch``, ``threads``.
     """
     task = Task.start(arguments, report)
-    models = map_images(task, sorted(arguments["periods"]))
+    models = _mapped(task, sorted(arguments["periods"]), arguments)
     submodels = [Submodel(f"submodel {i}", model) for i, model in enumerate(models)]
     return _merged(submodels, arguments, task)
+
+
+def _mapped(
+    task: Task, names: Sequence[str], arguments: Mapping[str, Any], label: str = ""
+) -> list[pycolmap.Reconstruction]:
+    """Models of images, with the focal lengths that photos state where images leave them open."""
+
+    def again(held: Task) -> list[pycolmap.Reconstruction]:
+        return map_images(held, names, label=f"{label}-held".strip("-"))
+
+    models = map_images(task, names, label=label)
+    return hold_focals(task, models, arguments.get("focals", {}), again)
 
 
 def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -65,9 +78,9 @@ def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     submodels = []
     for period in sorted(set(periods.values())):
         names = sorted(n for n, p in periods.items() if p == period)
-        models = map_images(task, names, label=f"period-{period}")
+        models = _mapped(task, names, arguments, f"period-{period}")
         for i, model in enumerate(models):
-            adjust(model, threads=task.threads)
+            adjust(model, task)
             label = f"period {period}" + (f" submodel {i}" if len(models) > 1 else "")
             submodels.append(Submodel(label, model, period, is_largest=i == 0))
     return _merged(submodels, arguments, task)
@@ -91,7 +104,7 @@ def _merged(
     if len(submodels) == 1:
         combined = Combined(submodels[0].model, (), (), ())
         model = combined.model
-        adjust(model, threads=task.threads)
+        adjust(model, task)
     else:
         task.report("aligning", 0, 1)
         combined = combine(submodels, matches, priors, task.database, keep_unplaced=keep_unplaced)
@@ -100,14 +113,14 @@ def _merged(
         for i in range(ROUNDS):
             task.report("adjusting", i, ROUNDS)
             model = triangulate(model, task, "points")
-            adjust(model, threads=task.threads)
+            adjust(model, task)
     if not keep_unplaced:  # periods that wait for tie points would contradict the others
         model = _settled(model, matches, len(arguments["periods"]), task)
     task.report("adjusting", 0, 1)
     placed, used = to_gps_frame(model, priors, task.remarks)
     if placed:
         before = summary(model)["reprojection_error_px"]
-        ended = adjust(model, priors=used, threads=task.threads)
+        ended = adjust(model, task, priors=used)
         after = summary(model)["reprojection_error_px"]
         task.remarks.append(
             f"bundle adjustment with {len(used.enu)} position priors: {ended.lower()}, "
@@ -130,7 +143,7 @@ def _settled(
         model = _complete(model, total, task)
         if not deregister_misplaced(model, matches, task.remarks):
             break
-        adjust(model, threads=task.threads)
+        adjust(model, task)
     return model
 
 
@@ -143,7 +156,7 @@ def _complete(model: pycolmap.Reconstruction, total: int, task: Task) -> pycolma
     added = int(fuller.num_reg_images()) - before
     if added <= 0:
         return model
-    adjust(fuller, threads=task.threads)
+    adjust(fuller, task)
     task.remarks.append(f"{added} more images registered with the merged model")
     return fuller
 
@@ -199,7 +212,7 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             "together",
         )
     report("adjusting", 0, 1)
-    ended = adjust(model, constant=old, threads=task.threads)
+    ended = adjust(model, task, constant=old)
     moved = _max_change(model, poses)
     task.remarks.append(f"{len(new)} new images registered")
     task.remarks.append(
@@ -213,7 +226,7 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (parameters by
     name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``out``, ``scratch``,
-    ``threads``.
+    ``threads``, ``short`` and ``held`` (of the model before).
     """
     task = Task.start(arguments, report)
     model = known_images(task.database)
@@ -224,7 +237,7 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         report("adjusting", i, 2)
         model = triangulate(model, task, "")
         _add_ties(model, arguments["ties"])
-        adjust(model, threads=task.threads)
+        adjust(model, task)
     task.remarks.append(f"adjusted with {len(arguments['ties'])} tie points")
     return task.finish(model)
 
