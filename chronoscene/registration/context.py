@@ -37,8 +37,8 @@ class Options:
     """Number of photos up to which all pairs are matched."""
     held_out: float = 0.1
     """Share of the tracks across periods that take no part in the estimation."""
-    camera_model: str = "SIMPLE_RADIAL"
-    """COLMAP's camera model for the photos."""
+    camera_model: str = "auto"
+    """COLMAP's camera model for the photos; ``auto`` for one that their number determines."""
     calibration: Calibration = "auto"
     """Sharing of calibrations between periods that used the same camera."""
     threads: int | None = None

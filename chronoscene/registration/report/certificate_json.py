@@ -181,6 +181,8 @@ def to_json(
                 "control_points": _rmse(position.control),
                 "cameras_against_gps": _rmse(position.gps),
                 "ground_pixel": position.ground_pixel,
+                "scale_error": position.scale_error,
+                "metadata": [asdict(c) for c in position.metadata],
             },
             "route": certificate.route,
             "unit": certificate.unit,
