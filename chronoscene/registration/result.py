@@ -19,6 +19,10 @@ Route = Literal["joint", "frozen", "separate"]
 ROUTES: tuple[Route, ...] = ("joint", "frozen", "separate")
 
 
+ANOTHER_PLACE = "another place, or wrong positions"
+"""End of the reason why photos of a period are missing that is far from the others."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossMatches:
     """Verified matches between two images of different periods that took no part in estimation.

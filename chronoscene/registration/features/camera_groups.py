@@ -16,8 +16,8 @@ between dates; but few photos, above all of flat ground from one height, do not 
 length, and a calibration of another date fits better."""
 
 AUTO, FEW, MANY = "auto", "SIMPLE_RADIAL", "OPENCV"
-"""Camera models of COLMAP: the choice between the other two, by the number of photos of a camera.
-From `MIN_PHOTOS` on, these determine a full model of the lens, which otherwise bends the scene."""
+"""Camera models of COLMAP: the choice between the other two. All photos are mapped with the first;
+`MIN_PHOTOS` of a camera determine the second (`reconstruct.lens`)."""
 
 SAME_VISIT = timedelta(days=1)
 """Time between periods up to which they count as one visit, with one calibration."""
@@ -52,16 +52,9 @@ def camera_groups(
         by_lens.setdefault(_lens(capture), []).append(capture)
     groups = [g for members in by_lens.values() for g in _SPLITTERS[calibration](members)]
     return [
-        {"names": sorted(names), "model": _model(model, len(names)), "params": None}
+        {"names": sorted(names), "model": FEW if model == AUTO else model, "params": None}
         for names in sorted(([c.name for c in group] for group in groups), key=min)
     ]
-
-
-def _model(asked: str, photos: int) -> str:
-    """Camera model of a group of photos."""
-    if asked != AUTO:
-        return asked
-    return MANY if photos >= MIN_PHOTOS else FEW
 
 
 def _lens(capture: Capture) -> tuple[Any, ...]:

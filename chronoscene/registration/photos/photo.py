@@ -23,6 +23,8 @@ DOP_METRES = 3.0  # Error of a position by a receiver without corrections, for a
 LEAST_ERROR = 1.0  # Metres; an error that EXIF states is never smaller
 MAX_ERROR = 1000.0  # A larger one is a mistake
 
+LOOK_SIDE = 24
+
 MIN_SIDE = 64  # Pixels; smaller images are icons and previews
 HEAD_BYTES = 200_000  # Bytes of a file that are searched for panorama metadata
 MAX_ASPECT = 3.0  # Wider images are panoramas, which no perspective camera model describes
@@ -59,6 +61,8 @@ class Capture:
     gps: Gps | None
     mask: Path | None = None
     """Its mask file, in ``masks/`` beside the folder of the photos."""
+    look: bytes = b""
+    """Grey levels of the photo reduced to `LOOK_SIDE` pixels a side, by which copies are found."""
 
 
 def open_photo(path: Path, name: str, period: int) -> Capture | str:
@@ -69,6 +73,8 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
             # A JPEG is then read to its end, but decoded at a reduced size.
             image.draft("RGB", (width // 8, height // 8))
             image.load()
+            small = image.convert("L").resize((LOOK_SIDE, LOOK_SIDE), Image.Resampling.BOX)
+            look = small.tobytes()
     except Exception as error:  # Pillow raises almost anything for damaged files
         return f"cannot be decoded: {str(error) or type(error).__name__}"
     if min(width, height) < MIN_SIDE:
@@ -87,6 +93,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
         taken=taken_at(path, exif),
         gps=_position(exif),
         mask=find_masks(beside, [name]).get(name),
+        look=look,
     )
 
 

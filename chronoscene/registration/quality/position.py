@@ -103,9 +103,9 @@ class Position:
     """Cameras against their GPS positions."""
     ground_pixel: float | None
     """Metres that a pixel covers, median over the surveyed points."""
-    scale_error: float | None
+    scale_error: float | None = None
     """Relative standard deviation of the scale by GPS."""
-    metadata: tuple[Comparison, ...]
+    metadata: tuple[Comparison, ...] = ()
     """The model beside what its photos state."""
 
     @property

@@ -8,7 +8,7 @@ structure repeats, a model with wrong poses has the most. The matches decide.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ def allow_short_tracks(options: pycolmap.IncrementalPipelineOptions) -> None:
     options.triangulation.ignore_two_view_tracks = False
     options.triangulation.min_angle = SHORT_ANGLE
     options.mapper.filter_min_tri_angle = SHORT_ANGLE
+    options.mapper.init_min_tri_angle = SHORT_ANGLE
     options.mapper.ba_local_min_tri_angle = SHORT_ANGLE
 
 
@@ -60,11 +61,19 @@ def without_weak_pairs(database: str, copy: Path, periods: Mapping[str, int]) ->
     return len(weak)
 
 
-def copy_database(database: str, copy: Path) -> None:
-    """Copy a database that no process has open."""
+def copy_database(
+    database: str, copy: Path, cameras: Mapping[int, tuple[str, Sequence[float]]] | None = None
+) -> None:
+    """Copy a database that no process has open, with other models and parameters of cameras."""
     copy.parent.mkdir(parents=True, exist_ok=True)
     pycolmap.Database.open(database).close()  # merges a journal
     shutil.copyfile(database, copy)
+    with pycolmap.Database.open(str(copy)) as opened:
+        for camera_id, (name, params) in (cameras or {}).items():
+            camera = opened.read_camera(camera_id)
+            camera.model = getattr(pycolmap.CameraModelId, name)
+            camera.params = params
+            opened.update_camera(camera)
 
 
 def weak_pairs(matches: Matches, period: Mapping[int, int]) -> list[tuple[int, int]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -43,7 +44,7 @@ def hold_focals(
     """
     if not models or task.held:
         return models
-    stated = _by_camera(models[0], focals)
+    stated = stated_focals(models[0], focals)
     found = {i: float(models[0].cameras[i].mean_focal_length()) for i in stated}
     used = {models[0].images[i].camera_id for i in models[0].reg_image_ids()}
     far = [i for i, (f, error) in stated.items() if contradicts(found[i], f, error)]
@@ -67,7 +68,7 @@ def hold_focals(
     return again
 
 
-def _by_camera(model: pycolmap.Reconstruction, focals: Focals) -> dict[int, tuple[float, float]]:
+def stated_focals(model: pycolmap.Reconstruction, focals: Focals) -> dict[int, tuple[float, float]]:
     """Stated focal length and error of the cameras of registered images."""
     found: dict[int, tuple[float, float]] = {}
     for image_id in sorted(model.reg_image_ids()):
@@ -80,17 +81,16 @@ def _by_camera(model: pycolmap.Reconstruction, focals: Focals) -> dict[int, tupl
 
 def _set_focals(task: Task, held: Task, focals: Focals) -> None:
     """Copy the database, with stated focal lengths."""
-    copy_database(task.database, task.scratch / "held.db")
-    with pycolmap.Database.open(held.database) as opened:
+    changed: dict[int, tuple[str, list[float]]] = {}
+    with pycolmap.Database.open(task.database) as opened:
         cameras = {int(c.camera_id): c for c in opened.read_all_cameras()}
         for image in opened.read_all_images():
-            camera = cameras.pop(int(image.camera_id), None)
-            if camera is None or str(image.name) not in focals:
-                continue
-            params = np.array(camera.params)
-            params[list(camera.focal_length_idxs())] = focals[str(image.name)][0]
-            camera.params = params
-            opened.update_camera(camera)
+            camera = cameras[int(image.camera_id)]
+            if str(image.name) in focals:
+                params = np.array(camera.params)
+                params[list(camera.focal_length_idxs())] = focals[str(image.name)][0]
+                changed[int(image.camera_id)] = str(camera.model_name), params.tolist()
+    copy_database(task.database, Path(held.database), changed)
 
 
 def _cost(

@@ -192,6 +192,8 @@ def _run(
     options.image_names = list(names)
     for key, value in settings.items():
         setattr(options.mapper, key, value)
+    if task.short:
+        allow_short_tracks(options)
     count = _counter(task.report, "mapping", len(names))
     models = pycolmap.incremental_mapping(
         task.database, task.photos, str(out), options, next_image_callback=count

@@ -16,6 +16,7 @@ from chronoscene.errors import RegistrationError
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import verified_matches
+from chronoscene.registration.reconstruct.candidates import copy_database
 from chronoscene.registration.reconstruct.consistency import (
     Matches,
     agreement,
@@ -24,6 +25,7 @@ from chronoscene.registration.reconstruct.consistency import (
 )
 from chronoscene.registration.reconstruct.focal import hold_focals
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
+from chronoscene.registration.reconstruct.lens import with_full_lens
 from chronoscene.registration.reconstruct.mapping import (
     Task,
     adjust,
@@ -50,8 +52,8 @@ def joint(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Map all images together; submodels that did not connect are merged afterwards.
 
     Arguments: ``database``, ``photos``, ``periods`` (by name), ``priors`` (``enu`` and ``sigma`` by
-    name, or null), ``focals`` (see `focal.Focals`), ``keep_unplaced`` (see `submodels.combine`),
-    ``out`` (model folder), ``scratch``, ``threads``.
+    name, or null), ``focals`` (see `focal.Focals`), ``full_lens`` (see `lens`), ``keep_unplaced``
+    (see `submodels.combine`), ``out`` (model folder), ``scratch``, ``threads``.
     """
     task = Task.start(arguments, report)
     models = _mapped(task, sorted(arguments["periods"]), arguments)
@@ -116,6 +118,8 @@ def _merged(
             adjust(model, task)
     if not keep_unplaced:  # periods that wait for tie points would contradict the others
         model = _settled(model, matches, len(arguments["periods"]), task)
+    if arguments.get("full_lens", False):
+        model = with_full_lens(model, task, arguments.get("focals", {}))
     task.report("adjusting", 0, 1)
     placed, used = to_gps_frame(model, priors, task.remarks)
     if placed:
@@ -224,15 +228,18 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Triangulate at given poses, add tie points, adjust, and write the model.
 
-    Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (parameters by
-    name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``out``, ``scratch``,
-    ``threads``, ``short`` and ``held`` (of the model before).
+    Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (model and
+    parameters by name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``out``,
+    ``scratch``, ``threads``, ``short`` and ``held`` (of the model before).
     """
     task = Task.start(arguments, report)
+    cameras: Mapping[str, tuple[str, list[float]]] = arguments["cameras"]
+    images = known_images(task.database).images.values()
+    found = {i.camera_id: cameras[str(i.name)] for i in images if str(i.name) in cameras}
+    copy_database(task.database, task.scratch / "refined.db", found)
+    task.database = str(task.scratch / "refined.db")
     model = known_images(task.database)
-    for image_id in set_poses(model, arguments["poses"]):
-        image = model.images[image_id]
-        model.cameras[image.camera_id].params = arguments["cameras"][str(image.name)]
+    set_poses(model, arguments["poses"])
     for i in range(2):
         report("adjusting", i, 2)
         model = triangulate(model, task, "")

@@ -264,6 +264,6 @@ def refine_arguments(model: Registered, points: TiePoints) -> dict[str, Any]:
     named = list(zip(model.names, model.cam_from_world, model.cameras, strict=True))
     return {
         "poses": {name: pose[:3].tolist() for name, pose, _ in named},
-        "cameras": {name: list(camera.params) for name, _, camera in named},
+        "cameras": {name: [camera.model, list(camera.params)] for name, _, camera in named},
         "ties": ties,
     }
