@@ -96,7 +96,10 @@ class PhotoInputs:
             if len(known):
                 middles[p] = np.median(known, axis=0)
         found = {}
+        most = max(middles, key=lambda p: int((periods == p).sum()), default=None)
         for p, middle in middles.items():
+            if p == most and self.scene is None:
+                continue
             others = [m for q, m in middles.items() if q != p]
             if self.scene is not None and self.georeference is not None:
                 others.append(np.zeros(3))
