@@ -35,8 +35,10 @@ from chronoscene.scene.geometry import camera_centre
 
 _ORIENTATION = 0x0112
 
-SAME_LOOK, MIN_CONTRAST = 1.0, 10.0
-"""Grey levels. Reduced pictures that differ by less are the same, unless they show too little."""
+ALIKE, SAME_PICTURE, MIN_CONTRAST = 8.0, 4.0, 10.0
+"""Grey levels. Photos that were read at a reduced size and differ by less are compared as a whole;
+copies of half the size and quality differ by 3.7 then, photos from a tripod at two dates by 13, and
+photos in a row by 7. Photos of so little contrast are not compared."""
 
 FAR_METRES = 2_000.0  # Between the positions of a period and all others: it is of another place
 
@@ -317,14 +319,25 @@ def drop_saved_again(
     refused = []
     for k, i in enumerate(distinct):
         rms = np.sqrt(np.mean((stack - stack[k]) ** 2, axis=1))
-        same = np.flatnonzero((rms < SAME_LOOK) & (period < period[k]))
-        if len(same):
-            first = captures[distinct[int(same[0])]].name
+        alike = np.flatnonzero((rms < ALIKE) & (period < period[k]))
+        same = [j for j in alike.tolist() if _same_picture(captures[distinct[j]], captures[i])]
+        if same:
+            first = captures[distinct[same[0]]].name
             reason = f"the same picture as {first}, saved again: a photo belongs to one date"
             refused.append((captures[i].name, captures[i].period, reason))
     gone = {name for name, *_ in refused}
     remarks = [f"{len(gone)} photos are pictures of an earlier period, saved again"] if gone else []
     return tuple(c for c in captures if c.name not in gone), refused, remarks
+
+
+def _same_picture(a: Capture, b: Capture) -> bool:
+    """Return True if two photos differ by their compression and size only."""
+    grey = []
+    for capture in (a, b):
+        with Image.open(capture.path) as image:
+            small = image.convert("L").resize((64, 64), Image.Resampling.BOX)
+        grey.append(np.asarray(small, np.float64))
+    return float(np.sqrt(np.mean((grey[0] - grey[1]) ** 2))) < SAME_PICTURE
 
 
 def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], list[str]]:
