@@ -19,7 +19,7 @@ from chronoscene.registration.reconstruct.candidates import copy_database
 from chronoscene.registration.reconstruct.focal import Focals, stated_focals
 from chronoscene.registration.reconstruct.mapping import Task, adjust, triangulate
 
-ROUNDS = 3  # Of bundle adjustment and triangulation
+ROUNDS = 1  # Of bundle adjustment and triangulation
 
 MIN_GAIN = 0.02  # Share by which the median reprojection error must shrink
 
