@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -110,17 +110,15 @@ class PhotoInputs:
                 found[p] = f"{away / 1000:,.0f} km from the other dates by GPS: {ANOTHER_PLACE}"
         return {c.name: found[c.period] for c in self.images if c.period in found}
 
-    def dates_of(self, registered: Collection[str]) -> tuple[str | None, ...]:
+    def dates_of(self, registered: frozenset[str]) -> tuple[str | None, ...]:
         """Dates of the periods, by the photos that are registered."""
         dates = list(self.dates)
         known = [c for c in self.images if c.taken and c.path in self.captures.undisputed]
         for p in {c.period for c in known}:
-            days = {c.taken.date() for c in known if c.period == p and c.taken}
-            left = {
-                c.taken.date() for c in known if c.period == p and c.taken and c.name in registered
-            }
-            if left != days:
-                dates[p] = period_date(self.labels[p], left)
+            mine = [c for c in known if c.period == p]
+            if not registered.issuperset(c.name for c in mine):
+                days = [c.taken.date() for c in mine if c.taken and c.name in registered]
+                dates[p] = period_date(self.labels[p], days)
         return tuple(dates)
 
     def centres(self) -> dict[str, list[float]]:

@@ -196,7 +196,7 @@ def _assemble(
         georeference=inputs.georeference if georeferenced else None,
         num_periods=len(inputs.labels),
         labels=inputs.labels,
-        dates=inputs.dates_of(set(names)),
+        dates=inputs.dates_of(frozenset(names)),
         held_out=cross_matches(tracks, periods),
         held_out_tracks=tracks,
         images_root=str(context.photos),

@@ -183,16 +183,14 @@ def _possible_ups(poses: Array) -> list[Array]:
     aside = poses.copy()  # photos on their side, as phones store them
     aside[:, 0, :3], aside[:, 1, :3] = poses[:, 1, :3], -poses[:, 0, :3]
     turned = upright_direction(aside)
-    ups = [upright_direction(poses), down, turned, -turned]
-    return [up / np.linalg.norm(up) for up in ups if np.linalg.norm(up) > 1e-6]
+    return [up for up in (upright_direction(poses), down, turned, -turned) if up.any()]
 
 
 def _turn_up(up: Array) -> Array:
     """Rotation that takes a direction to the zenith. [3, 3]"""
-    side = np.eye(3)[np.argmin(np.abs(up))]
-    x = np.cross(side, up)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(up, x), up])
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.align_vectors([[0, 0, 1]], [up])[0].as_matrix())
 
 
 def _first_guess(poses: Array, enu: Array) -> Sim3 | None:

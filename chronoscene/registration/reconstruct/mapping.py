@@ -129,7 +129,8 @@ def map_images(
     folder = task.scratch / label
     for number, (kind, settings) in enumerate(SETTINGS):
         models = _run(task, folder / f"mapping-{number}", names, settings)
-        found.append(_attempt(task, f"mapping with {kind} settings", models, label))
+        found.append((kind, task, models))
+        _note(task, f"mapping with {kind} settings", models, label)
         if models and models[0].num_reg_images() >= SATISFIED * len(names):
             return models
     certain = replace(task, database=str(folder / "certain.db"), short=True)
@@ -137,32 +138,24 @@ def map_images(
         task.remarks.append(
             f"{weak} pairs of photos of two dates left out: few matches, none confirmed by others"
         )
-    models = _run(certain, folder / "short", names, SETTINGS[-1][1])
-    found.append(_attempt(certain, "mapping with short tracks", models, label))
-    models = _disjoint(map_globally(certain, folder / "global", names))
-    found.append(_attempt(certain, "global mapping", models, label))
+    short = _run(certain, folder / "short", names, SETTINGS[-1][1])
+    overall = _disjoint(map_globally(certain, folder / "global", names))
+    for kind, models in (("short tracks", short), ("the global mapper", overall)):
+        found.append((kind, certain, models))
+        _note(task, f"mapping with {kind}", models, label)
     _, matches = verified_matches(certain.database)
-    best = max(found, key=lambda a: support(a.models[0], matches) if a.models else 0)
-    if best.models:
-        task.remarks.append(f"{best.kind}: chosen, as most matches agree with it")
-        task.database, task.short = best.task.database, best.task.short
-    return best.models
+    kind, best, models = max(found, key=lambda f: support(f[2][0], matches) if f[2] else 0)
+    if models:
+        task.remarks.append(f"{kind}: chosen, as most matches agree with it")
+        task.database, task.short = best.database, best.short
+    return models
 
 
-@dataclass(frozen=True, slots=True)
-class _Attempt:
-    """Models of one attempt, the largest first."""
-
-    kind: str
-    task: Task
-    models: list[pycolmap.Reconstruction]
-
-
-def _attempt(task: Task, kind: str, models: list[pycolmap.Reconstruction], label: str) -> _Attempt:
+def _note(task: Task, kind: str, models: Sequence[pycolmap.Reconstruction], label: str) -> None:
+    """Log what an attempt gave."""
     sizes = [int(m.num_reg_images()) for m in models]
     remark = f"{kind}: models of {sizes or 'no'} images"
     task.remarks.append(f"{label.replace('-', ' ')}: {remark}" if label else remark)
-    return _Attempt(kind, task, models)
 
 
 def pipeline_options(task: Task) -> pycolmap.IncrementalPipelineOptions:

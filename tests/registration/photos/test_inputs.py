@@ -158,5 +158,5 @@ def test_photos_that_are_not_registered_do_not_date_a_period(folder: Path) -> No
     captures = read_captures(folder)
     found = gathered(captures.images, captures)
     first = [p.label for p in captures.periods].index("before")
-    assert found.dates_of({c.name for c in captures.images})[first] == "2016"
-    assert found.dates_of({"before/0.jpg", "before/1.jpg"})[first] == "2016-03-01"
+    assert found.dates_of(frozenset(c.name for c in captures.images))[first] == "2016"
+    assert found.dates_of(frozenset({"before/0.jpg", "before/1.jpg"}))[first] == "2016-03-01"
