@@ -107,7 +107,7 @@ class Registered:
     images_root: str
     """Folder of the images: photos as ``cameras`` describe them."""
     stated: Mapping[str, Stated] = field(default_factory=dict)
-    """What the metadata of photos state, by name."""
+    """Metadata of photos to compare with, by name."""
     short: bool = False
     """True if points of two images and of small angles count."""
     held: bool = False

@@ -21,7 +21,7 @@ MAX_ASPECT_CHANGE = 0.02  # A photo of another shape than its metadata say has b
 
 @dataclass(frozen=True, slots=True)
 class Stated:
-    """What the metadata of a photo state; None for what is missing."""
+    """Metadata of a photo to compare a model with; None for what is missing."""
 
     focal: float | None = None
     """Pixels of the photo as it is."""
