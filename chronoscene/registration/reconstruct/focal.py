@@ -96,7 +96,7 @@ def _set_focals(task: Task, held: Task, focals: Focals) -> None:
 def _cost(
     free: list[pycolmap.Reconstruction], held: list[pycolmap.Reconstruction], task: Task
 ) -> str | None:
-    """Say why a model with held focal lengths is worse; None if it is as good."""
+    """Describe how a model with held focal lengths is worse; None if it is as good."""
     if not held or held[0].num_reg_images() < free[0].num_reg_images():
         return "with that one, fewer images are registered"
     errors = [float(np.median([p.error for p in m[0].points3D.values()])) for m in (free, held)]
