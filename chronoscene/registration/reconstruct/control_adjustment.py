@@ -73,7 +73,7 @@ def adjust_with_control(
         image = work.images[image_id]
         frame = model.frames[model.images[image_id].frame_id]
         frame.set_cam_from_world(image.camera_id, image.cam_from_world())
-        model.cameras[image.camera_id].params = work.cameras[image.camera_id].params
+        model.cameras[image.camera_id].params = list(work.cameras[image.camera_id].params)
     for point_id, point3D in model.points3D.items():
         point3D.xyz = np.array(work.points3D[point_id].xyz)
     return ids
