@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numba import prange
 from numpy import float32
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.checks import check_shape
@@ -136,6 +137,35 @@ def _composite_backward(  # type: ignore[no-untyped-def]
                     shade += d_values[i, c] * values[i, c]
                 d_densities[i] = lengths[i] * (d_densities[i] - behind + rest)
                 behind += shade
+
+
+@torch.no_grad()
+def visible(densities: Tensor, lengths: Tensor, groups: Groups) -> tuple[Tensor, NDArray[np.int64]]:
+    """Find the samples that have a weight: the first ones of each ray.
+
+    Returns:
+        seen: Their numbers, ascending. int64 [K]
+        starts: First of each ray among them, and the number of all. [R + 1]
+    """
+    given = [t.detach().cpu().contiguous().numpy() for t in (densities, lengths)]
+    starts = groups.starts.cpu().numpy()
+    counts = np.zeros(len(starts), np.int64)
+    _count_visible(*given, starts, counts)
+    ends = np.cumsum(counts)
+    first = np.repeat(starts[:-1] - ends[:-1], counts[1:])
+    return torch.from_numpy(np.arange(ends[-1]) + first).to(densities.device), ends
+
+
+@kernel(fast_math=True, parallel=True)
+def _count_visible(densities, lengths, starts, counts):  # type: ignore[no-untyped-def]
+    rays, stop = len(starts) - 1, float32(STOP)
+    for block in prange((rays + _BLOCK - 1) // _BLOCK):
+        for ray in range(block * _BLOCK, min(rays, (block + 1) * _BLOCK)):
+            clear, end = _ONE, starts[ray]
+            while end < starts[ray + 1] and clear >= stop:
+                clear *= math.exp(-densities[end] * lengths[end])
+                end += 1
+            counts[ray + 1] = end - starts[ray]
 
 
 class _TruncatedExp(torch.autograd.Function):

@@ -99,7 +99,8 @@ class _Encode(torch.autograd.Function):
     def forward(ctx: Any, table: Tensor, places: Tensor, layout: GridLayout) -> Tensor:
         out = torch.empty(len(places), layout.width)
         levels = layout.resolutions, layout.starts, layout.dense
-        encode_forward(places.numpy(), table.detach().numpy(), *levels, out.numpy())
+        flat = table.detach().contiguous().view(-1).numpy()
+        encode_forward(places.numpy(), flat, *levels, out.view(-1).numpy())
         ctx.places, ctx.levels = places, levels
         return out
 

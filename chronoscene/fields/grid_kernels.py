@@ -6,11 +6,15 @@ from numba import prange
 from numpy import float32, int64, uint32
 
 from chronoscene.kernels.compilation import inlined, kernel
+from chronoscene.kernels.memory import make_load, store
+from chronoscene.kernels.vectors import make_splat, multiply_add
 
-BLOCK = 1024  # Places whose codes stay in the cache while the levels are walked through
+BLOCK = 8192  # Places for which a level is read before the next one displaces it in the cache
 PRIMES = (uint32(2654435761), uint32(805459861))
 ONE = float32(1)
 ZERO = float32(0)
+# Pairs of features, rather than several places at once: gathers are slow on many processors.
+_load_pair, _pair = make_load(2), make_splat("f32", 2)
 
 
 @inlined
@@ -27,11 +31,11 @@ def encode_forward(places, table, resolutions, starts, dense, out):  # type: ign
 
     Args:
         places: [N, 3]
-        table: [E, 2]
+        table: Flat [E, 2].
         resolutions: Cells along an edge. int64 [L]
         starts: First row of each level, and the end. int64 [L + 1]
         dense: Whether each grid point has a row of its own. bool [L]
-        out: Written. [N, 2 L]
+        out: Written. Flat [N, 2 L].
     """
     count, levels = places.shape[0], resolutions.shape[0]
     for block in prange((count + BLOCK - 1) // BLOCK):
@@ -43,17 +47,15 @@ def encode_forward(places, table, resolutions, starts, dense, out):  # type: ign
                 px, py, pz = places[i, 0] * cells, places[i, 1] * cells, places[i, 2] * cells
                 x, y, z = int(px), int(py), int(pz)
                 fx, fy, fz = px - float32(x), py - float32(y), pz - float32(z)
-                first = second = ZERO
+                total = _pair(ZERO)
                 for corner in range(8):
                     cx, cy, cz = corner & 1, (corner >> 1) & 1, corner >> 2
                     weight = (
                         (fx if cx else ONE - fx) * (fy if cy else ONE - fy) * (fz if cz else ONE - fz)
                     )
                     row = start + _row(is_dense, points, mask, x + cx, y + cy, z + cz)
-                    first += weight * table[row, 0]
-                    second += weight * table[row, 1]
-                out[i, 2 * level] = first
-                out[i, 2 * level + 1] = second
+                    total = multiply_add(_load_pair(table, 2 * row), weight, total)
+                store(out, 2 * (i * levels + level), total)
 
 
 @kernel(fast_math=True, parallel=True)
