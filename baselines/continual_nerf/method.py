@@ -13,7 +13,7 @@ from torch import Tensor
 from baselines.continual_nerf.config import ContinualConfig
 from chronoscene.fields.method import FieldMethod
 from chronoscene.fields.network import Codes
-from chronoscene.fields.rays import PixelPool
+from chronoscene.fields.rays import PixelPool, Rays
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.methods.interface import no_mask
 from chronoscene.training.periods import with_new_periods
@@ -85,8 +85,8 @@ class CLNeRF(FieldMethod):
             params[name] = 0.1 * torch.randn(periods, size, generator=generator)
         return params
 
-    def codes(self, views: NDArray[np.int64]) -> Codes:
-        periods = self.tensor(self.pool.periods[views])
+    def codes(self, rays: Rays) -> Codes:
+        periods = self.tensor(self.pool.periods[rays.views])
         names = "geometry", "appearance"
         return Codes(*(self.network.params[name].index_select(0, periods) for name in names))
 

@@ -181,6 +181,26 @@ class _TruncatedExp(torch.autograd.Function):
         return grads[0] * ctx.slope  # type: ignore[no-any-return]
 
 
+class _Softplus(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.x = x.detach()
+        if x.is_cuda:
+            return torch.nn.functional.softplus(ctx.x)
+        return torch.from_numpy(np.logaddexp(ctx.x.numpy(), 0, dtype=ctx.x.numpy().dtype))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        if ctx.x.is_cuda:
+            return grads[0] * ctx.x.sigmoid()  # type: ignore[no-any-return]
+        return grads[0] / (1 + torch.from_numpy(np.exp(-ctx.x.numpy().clip(-80))))
+
+
+def softplus(x: Tensor) -> Tensor:
+    """log(1 + exp x), with equal bits for any number of threads."""
+    return _Softplus.apply(x)  # type: ignore[no-any-return]
+
+
 def truncated_exp(x: Tensor) -> Tensor:
     """Density of a network's output: exp, cut off above, where its gradient stays finite."""
     return _TruncatedExp.apply(x)  # type: ignore[no-any-return]

@@ -62,6 +62,8 @@ class FieldMethod(ABC):
     """Name on the command line."""
     version: ClassVar[str] = "1"
     """Version of the implementation; stored with every model."""
+    geometry_varies: ClassVar[bool] = True
+    """Whether densities depend on the period, so that each has an occupancy grid of its own."""
     network_class: ClassVar[type[FieldNetwork]] = FieldNetwork
 
     def __init__(self, config: FieldConfig) -> None:
@@ -76,8 +78,8 @@ class FieldMethod(ABC):
         """Draw the tensors of a new field."""
 
     @abstractmethod
-    def codes(self, views: NDArray[np.int64]) -> Codes:
-        """Return the codes of rays, by the number of their view in `pool`. [R, ...]"""
+    def codes(self, rays: Rays) -> Codes:
+        """Return the codes of rays of `pool`. [R, ...]"""
 
     @abstractmethod
     def view_codes(self, geometry_period: float, appearance_period: float) -> Codes:
@@ -98,7 +100,10 @@ class FieldMethod(ABC):
         self.box = box_of(train)
         self.pool = self.make_pool(train)
         cells = min(self.config.cells, sensible_cells(train.views, self.box))
-        self.occupancy = start_occupancy(train, self.box, self.pool, cells, self.config.spacing)
+        grids = train.num_periods if self.geometry_varies else 1
+        self.occupancy = start_occupancy(
+            train, self.box, self.pool, grids, cells, self.config.spacing
+        )
         self.meta = {
             "method": self.name,
             "version": self.version,
@@ -140,7 +145,7 @@ class FieldMethod(ABC):
         samples = self.march(rays, self.pool.periods[rays.views], jitter)
         if len(samples.lengths) == 0:
             return StepReport(0.0, count, "empty")
-        drawn, _ = self.draw(rays, samples, self.codes(rays.views))
+        drawn, _ = self.draw(rays, samples, self.codes(rays))
         loss = self.loss(drawn, rays, progress)
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -184,6 +189,7 @@ class FieldMethod(ABC):
         self, rays: Rays, periods: NDArray[np.int64], jitter: NDArray[np.float32]
     ) -> Samples:
         """Place samples on rays."""
+        periods = np.minimum(periods, len(self.occupancy.grids[0]) - 1)
         origins = self.box.to_cube(rays.origins)
         fixed = self.occupancy.grids, self.box, self.occupancy.step, self.config.shells
         return march(origins, rays.directions, periods, jitter, *fixed)  # type: ignore[arg-type]
@@ -280,8 +286,9 @@ class FieldMethod(ABC):
             box = self.meta["box"]
             self.box = SceneBox(tuple(box["centre"]), box["half"], tuple(box["sides"]))
             grids = {name: tensors.pop(f"occupied.{name}").cpu().numpy() for name in _GRIDS}
+            periods = self.meta["num_periods"] if self.geometry_varies else 1
             self.occupancy = Occupancy.restore(
-                self.meta["num_periods"], self.meta["cells"], self.config.spacing, grids
+                periods, self.meta["cells"], self.config.spacing, grids
             )
             self.network = self.network_class(self.config, tensors)
         except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:

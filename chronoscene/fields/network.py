@@ -76,8 +76,12 @@ class FieldNetwork:
     def encode(self, places: Tensor) -> Tensor:
         """Return the code of each place. [N, E]"""
         if self.config.encoding == "grid":
-            return encode(places, self.params["table"], self.config.layout)
+            return self.encode_with("table", places)
         return frequency_code(4 * places - 2, self.config.frequencies)
+
+    def encode_with(self, table: str, places: Tensor) -> Tensor:
+        """Return the code of each place in a hash grid, by the name of its table."""
+        return encode(places, self.params[table], self.config.layout)
 
     def density(self, places: Tensor, groups: Groups, geometry: Tensor) -> tuple[Tensor, Tensor]:
         """Return densities [N] and features [N, F] of places of some rays."""

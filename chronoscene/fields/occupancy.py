@@ -106,7 +106,7 @@ def _places(
 
 
 def start_occupancy(
-    train: TrainingSet, box: SceneBox, pool: PixelPool, cells: int, spacing: float
+    train: TrainingSet, box: SceneBox, pool: PixelPool, num_periods: int, cells: int, spacing: float
 ) -> Occupancy:
     """Begin with the cells of sparse points, dilated as long as that reaches more of the photos.
 
@@ -117,7 +117,7 @@ def start_occupancy(
     at = np.floor((box.to_cube(train.points) + 1) * cells / 2).astype(np.int64)
     at = at[((at >= 0) & (at < cells)).all(axis=1)]
     if len(at) == 0:
-        return Occupancy(train.num_periods, cells, spacing, np.ones_like(allowed))
+        return Occupancy(num_periods, cells, spacing, np.ones_like(allowed))
     allowed[tuple(at.T)] = True
     rays = pool.draw(np.random.default_rng(0), 4096)
     origins, reached = box.to_cube(rays.origins), 0.0
@@ -131,4 +131,4 @@ def start_occupancy(
         if share < reached + _GAIN:
             break
         reached = share
-    return Occupancy(train.num_periods, cells, spacing, allowed)
+    return Occupancy(num_periods, cells, spacing, allowed)

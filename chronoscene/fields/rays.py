@@ -29,6 +29,8 @@ class Rays(NamedTuple):
     """Number of the view of each ray in its pool. [R]"""
     colors: NDArray[np.float32]
     """0..1. [R, 3]"""
+    pixels: NDArray[np.float32]
+    """Place in the image, 0..1. [R, 2]"""
 
 
 def _pixel_to_world(view: View) -> NDArray[np.float64]:
@@ -49,7 +51,8 @@ def view_rays(view: View, pixels: NDArray[np.int64]) -> Rays:
     directions, depths = _unit(image @ _pixel_to_world(view).T)
     origins = np.broadcast_to(camera_centre(view.cam_from_world), (len(pixels), 3))
     nothing = np.zeros(len(pixels), np.int64), np.zeros((len(pixels), 3), np.float32)
-    return Rays(origins, directions, depths, *nothing)
+    places = (image[:, :2] / [view.width, view.height]).astype(np.float32)
+    return Rays(origins, directions, depths, *nothing, places)
 
 
 class PixelPool:
@@ -89,7 +92,7 @@ class PixelPool:
         self.ends = np.cumsum([len(chosen) for chosen in pixels])
         self._pixels = np.concatenate(pixels)
         self._colors = np.concatenate(colors)
-        self._widths = np.array([view.width for view in self.views])
+        self._sizes = np.array([(view.width, view.height) for view in self.views])
         self._matrices = np.stack([_pixel_to_world(view) for view in self.views])
         self._centres = np.stack([camera_centre(view.cam_from_world) for view in self.views])
         self.periods = np.array([view.period for view in self.views], np.int64)
@@ -102,8 +105,9 @@ class PixelPool:
         """Draw rays of all views, with replacement."""
         chosen = generator.integers(len(self), size=count)
         views = np.searchsorted(self.ends, chosen, side="right")
-        rows, columns = np.divmod(self._pixels[chosen], self._widths[views])
+        rows, columns = np.divmod(self._pixels[chosen], self._sizes[views, 0])
         image = np.stack([columns + 0.5, rows + 0.5, np.ones(count)], axis=1)
         directions, depths = _unit(np.einsum("rij,rj->ri", self._matrices[views], image))
         colors = self._colors[chosen].astype(np.float32) / np.float32(255)
-        return Rays(self._centres[views], directions, depths, views, colors)
+        places = (image[:, :2] / self._sizes[views]).astype(np.float32)
+        return Rays(self._centres[views], directions, depths, views, colors, places)

@@ -1,0 +1,39 @@
+"""Codes of the time t, from 0 at the first period to 1 at the last."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from chronoscene.fields.network import frequency_code
+
+LEAST_WIDTH = 1e-3
+FIRST_WIDTH = 0.3
+
+
+def step_code(t: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
+    """Evaluate learned step functions: hard steps, with the slope of smooth ones.
+
+    The smooth step is the cumulative Laplace distribution around the centre u with the width
+    b = max(|b|, 1e-3): exp(-(u - t) / b) / 2 below u, 1 - exp(-(t - u) / b) / 2 above.
+
+    Source: Lin et al. 2023, "Neural Scene Chronology", section 3.3.
+
+    Args:
+        t: [R]
+        centres: [J]
+        widths: [J]
+
+    Returns:
+        0 or 1. [R, J]
+    """
+    away = t[:, None] - centres
+    tail = torch.exp(-away.abs() / widths.abs().clamp_min(LEAST_WIDTH)) / 2
+    smooth = torch.where(away < 0, tail, 1 - tail)
+    hard = (away >= 0).to(smooth)
+    return hard + smooth - smooth.detach()
+
+
+def wave_code(t: Tensor, count: int) -> Tensor:
+    """Time with its sines and cosines. [R] -> [R, 1 + 2 count]"""
+    return frequency_code(t[:, None], count)
