@@ -28,10 +28,11 @@ def step_code(t: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
         0 or 1. [R, J]
     """
     away = t[:, None] - centres
-    tail = torch.exp(-away.abs() / widths.abs().clamp_min(LEAST_WIDTH)) / 2
-    smooth = torch.where(away < 0, tail, 1 - tail)
-    hard = (away >= 0).to(smooth)
-    return hard + smooth - smooth.detach()
+    width = widths.abs().clamp_min(LEAST_WIDTH)
+    below = torch.exp(away.clamp_max(0) / width) / 2
+    above = 1 - torch.exp(-away.clamp_min(0) / width) / 2
+    smooth = torch.where(away < 0, below, above)
+    return (away >= 0).to(smooth) + (smooth - smooth.detach())
 
 
 def wave_code(t: Tensor, count: int) -> Tensor:

@@ -116,7 +116,7 @@ def start_occupancy(
     allowed = np.zeros((cells,) * 3, bool)
     at = np.floor((box.to_cube(train.points) + 1) * cells / 2).astype(np.int64)
     at = at[((at >= 0) & (at < cells)).all(axis=1)]
-    if len(at) == 0:
+    if len(at) == 0 or len(pool) == 0:
         return Occupancy(num_periods, cells, spacing, np.ones_like(allowed))
     allowed[tuple(at.T)] = True
     rays = pool.draw(np.random.default_rng(0), 4096)
