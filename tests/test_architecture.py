@@ -41,8 +41,7 @@ LAYERS = (
 """From the top down. A module imports from its own package and from lower layers."""
 
 TORCH_SIDE = {
-    f"chronoscene.{name}"
-    for name in ("anchors", "gaussians", "fields", "training", "rasterizer")
+    f"chronoscene.{name}" for name in ("anchors", "gaussians", "fields", "training", "rasterizer")
 }
 """Packages that need torch and are used by methods only."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from chronoscene.methods import MethodSpec, Range
-from chronoscene.methods.spec import PeriodInput
 
 _PLAIN: dict[str, Any] = {  # the network of NeRF
     "encoding": "frequencies",
@@ -21,49 +20,68 @@ _PLAIN: dict[str, Any] = {  # the network of NeRF
 _GRID: dict[str, Any] = {"opacity_weight": 1e-3}
 
 
-def _spec(
-    name: str, title: str, paper: str, licence: str, period_input: PeriodInput, flags: dict[str, Any],
-    method: str,
-) -> MethodSpec:  # fmt: skip
-    return MethodSpec(
-        name=name,
-        title=title,
-        paper=paper,
-        licence=licence,
-        period_input=period_input,
-        outputs=("rgb", "alpha", "depth"),
-        devices=("cpu", "cuda"),
-        method=f"baselines.nerf.method:{method}",
-        config="baselines.nerf.config:NerfConfig",
-        presets={
-            "paper": _PLAIN | flags,
-            "balanced": _GRID | flags | {"iterations": 4_000},
-            "fast": _GRID | flags | {"iterations": 1_000, "samples": 32_768, "finest": 2_048},
-        },
-        mixes_views=True,
-        learns_background=True,
-        resumable=True,
-        main_options=("iterations", "samples", "encoding", "log2_rows", "finest", "learning_rate"),
-        search={"learning_rate": Range(1e-3, 3e-2), "log2_rows": Range(15, 19, "int")},
-    )
+def _presets(flags: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Presets of a method, by its flags."""
+    return {
+        "paper": _PLAIN | flags,
+        "balanced": _GRID | flags | {"iterations": 4_000},
+        "fast": _GRID | flags | {"iterations": 1_000, "samples": 32_768, "finest": 2_048},
+    }
 
 
-NERF = _spec(
-    "nerf", "NeRF", "Mildenhall et al., NeRF: Representing Scenes as Neural Radiance Fields for View "
-    "Synthesis, ECCV 2020", "Apache-2.0 (the official code is under the MIT licence)", "none", {},
-    "Nerf",
-)  # fmt: skip
-NERF_T = _spec(
-    "nerf-t", "NeRF-T", "Mildenhall et al., NeRF, ECCV 2020, with the time as a further input",
-    "Apache-2.0", "continuous", {"time": "frequencies"}, "NerfT",
-)  # fmt: skip
-NERF_W = _spec(
-    "nerf-w", "NeRF-W", "Martin-Brualla et al., NeRF in the Wild: Neural Radiance Fields for "
-    "Unconstrained Photo Collections, CVPR 2021", "Apache-2.0 (no official code)", "none",
-    {"appearance": "image", "transient": "density"}, "NerfW",
-)  # fmt: skip
-NEUSC = _spec(
-    "neusc", "NeuSC", "Lin et al., Neural Scene Chronology, CVPR 2023",
-    "Apache-2.0 (written from a description; the official code is non-commercial)", "continuous",
-    {"time": "steps", "appearance": "image", "transient": "mask"}, "NeuSC",
-)  # fmt: skip
+_COMMON: dict[str, Any] = {
+    "outputs": ("rgb", "alpha", "depth"),
+    "devices": ("cpu",),
+    "config": "baselines.nerf.config:NerfConfig",
+    "mixes_views": True,
+    "learns_background": True,
+    "resumable": True,
+    "main_options": (
+        "iterations", "samples", "encoding", "log2_rows", "finest", "learning_rate"
+    ),
+    "search": {"learning_rate": Range(1e-3, 3e-2), "log2_rows": Range(15, 19, "int")},
+}  # fmt: skip
+
+NERF = MethodSpec(
+    name="nerf",
+    title="NeRF",
+    paper="Mildenhall et al., NeRF: Representing Scenes as Neural Radiance Fields for View "
+    "Synthesis, ECCV 2020",
+    licence="Apache-2.0 (the official code is under the MIT licence)",
+    period_input="none",
+    method="baselines.nerf.method:Nerf",
+    presets=_presets({}),
+    **_COMMON,
+)
+NERF_T = MethodSpec(
+    name="nerf-t",
+    title="NeRF-T",
+    paper="Mildenhall et al., NeRF, ECCV 2020, with the time as a further input",
+    licence="Apache-2.0",
+    period_input="continuous",
+    method="baselines.nerf.method:NerfT",
+    presets=_presets({"time": "frequencies"}),
+    **_COMMON,
+)
+NERF_W = MethodSpec(
+    name="nerf-w",
+    title="NeRF-W",
+    paper="Martin-Brualla et al., NeRF in the Wild: Neural Radiance Fields for Unconstrained Photo "
+    "Collections, CVPR 2021",
+    licence="Apache-2.0 (no official code was released)",
+    period_input="none",
+    method="baselines.nerf.method:NerfW",
+    presets=_presets({"appearance": "image", "transient": "density"}),
+    **_COMMON,
+)
+NEUSC = MethodSpec(
+    name="neusc",
+    title="NeuSC",
+    paper="Lin et al., Neural Scene Chronology, CVPR 2023",
+    licence="Apache-2.0 (written from descriptions of the paper; the official code is "
+    "non-commercial)",
+    period_input="continuous",
+    method="baselines.nerf.method:NeuSC",
+    presets=_presets({"time": "steps", "appearance": "image", "transient": "mask"}),
+    **_COMMON,
+)

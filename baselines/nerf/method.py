@@ -119,7 +119,12 @@ class Nerf(FieldMethod):
         """Error over the uncertainty of each ray, as in NeRF-W, equation 13."""
         beta = drawn.values[:, 3] + self.config.least_uncertainty
         error = (squares / (2 * beta.square())[:, None]).mean()
-        return error + 3 + torch.log(beta).mean() + self.config.transient_weight * drawn.values[:, 4].mean()
+        return (
+            error
+            + 3
+            + torch.log(beta).mean()
+            + self.config.transient_weight * drawn.values[:, 4].mean()
+        )
 
     def _masks(self, rays: Rays) -> Tensor:
         """Return how much of what rays show is in their photo alone, 0..1. [R, 1]"""

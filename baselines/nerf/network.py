@@ -96,5 +96,3 @@ class ContentNetwork(NerfNetwork):
         rgb = self.mlp("content_rgb", content, when[:, :0], groups, "sigmoid")
         lit = self.mlp("light", torch.cat((content, rgb), dim=1), light, groups, "sigmoid")
         return torch.cat((lit, rgb), dim=1)
-
-

@@ -19,7 +19,7 @@ from torch import Tensor
 from chronoscene.checks import check_shape
 from chronoscene.fields.mlp import Groups
 from chronoscene.kernels.compilation import kernel
-from chronoscene.training.devices import has_kernels
+from chronoscene.training import devices
 
 STOP = 1e-4
 """Transmittance below which nothing more is seen, as in Instant-NGP."""
@@ -64,8 +64,8 @@ def composite(
     """
     check_shape("values", values, (len(densities), None))
     check_shape("lengths", lengths, (len(densities),))
-    if has_kernels(densities, values, lengths):
-        return _Composite.apply(densities, values, lengths, groups)  # type: ignore[no-any-return]
+    if devices.has_kernels(densities, values, lengths):
+        return _Composite.apply(densities, values, lengths, groups)
     return composite_reference(densities, values, lengths, groups)
 
 
@@ -174,11 +174,11 @@ class _TruncatedExp(torch.autograd.Function):
         # NumPy makes one pass, where torch may take another path at the end of a thread's share.
         clipped = x.detach().clamp(max=_LIMIT).contiguous()
         ctx.slope = clipped.exp() if x.is_cuda else torch.from_numpy(np.exp(clipped.numpy()))
-        return ctx.slope.clone()  # type: ignore[no-any-return]
+        return ctx.slope.clone()
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        return grads[0] * ctx.slope  # type: ignore[no-any-return]
+        return grads[0] * ctx.slope
 
 
 class _Softplus(torch.autograd.Function):
@@ -192,15 +192,15 @@ class _Softplus(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
         if ctx.x.is_cuda:
-            return grads[0] * ctx.x.sigmoid()  # type: ignore[no-any-return]
+            return grads[0] * ctx.x.sigmoid()
         return grads[0] / (1 + torch.from_numpy(np.exp(-ctx.x.numpy().clip(-80))))
 
 
 def softplus(x: Tensor) -> Tensor:
     """log(1 + exp x), with equal bits for any number of threads."""
-    return _Softplus.apply(x)  # type: ignore[no-any-return]
+    return _Softplus.apply(x)
 
 
 def truncated_exp(x: Tensor) -> Tensor:
     """Density of a network's output: exp, cut off above, where its gradient stays finite."""
-    return _TruncatedExp.apply(x)  # type: ignore[no-any-return]
+    return _TruncatedExp.apply(x)

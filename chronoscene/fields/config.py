@@ -22,8 +22,8 @@ class FieldConfig:
     most_rays: PositiveInt = 8_192
     """Rays of a step at most."""
     encoding: Literal["grid", "frequencies"] = "grid"
-    """Code of a place: ``grid``, features of a multiresolution hash grid; ``frequencies``, sines and
-    cosines, as in NeRF."""
+    """Code of a place: ``grid``, features of a multiresolution hash grid; ``frequencies``, sines
+    and cosines, as in NeRF."""
     levels: PositiveInt = 16
     """Levels of the hash grid."""
     log2_rows: Annotated[int, Field(ge=4, le=24)] = 17

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.fields.grid_kernels import encode_backward, encode_forward
-from chronoscene.training.devices import has_kernels
+from chronoscene.training import devices
 
 FEATURES = 2
 """Features of a row of the table."""
@@ -71,8 +71,9 @@ def encode_reference(places: Tensor, table: Tensor, layout: GridLayout) -> Tenso
     """Interpolate the code of each place in plain torch: the definition of `encode`.
 
     On a level with R cells along an edge, a place x lies in the cell floor(R x); the features of
-    its eight corners are mixed trilinearly. Corner (i, j, k) has the row i + (R + 1) (j + (R + 1) k)
-    on a dense level, else (i xor 2654435761 j xor 805459861 k) mod the rows of the level.
+    its eight corners are mixed trilinearly. Corner (i, j, k) has the row
+    i + (R + 1) (j + (R + 1) k) on a dense level, else (i xor 2654435761 j xor 805459861 k) mod the
+    rows of the level.
     """
     parts = []
     for level, cells in enumerate(layout.resolutions.tolist()):
@@ -127,6 +128,6 @@ def encode(places: Tensor, table: Tensor, layout: GridLayout) -> Tensor:
     """
     check_shape("places", places, (None, 3))
     check_shape("table", table, (int(layout.starts[-1]), FEATURES))
-    if has_kernels(places, table):
-        return _Encode.apply(table, places.contiguous(), layout)  # type: ignore[no-any-return]
+    if devices.has_kernels(places, table):
+        return _Encode.apply(table, places.contiguous(), layout)
     return encode_reference(places, table, layout)

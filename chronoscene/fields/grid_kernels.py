@@ -51,7 +51,9 @@ def encode_forward(places, table, resolutions, starts, dense, out):  # type: ign
                 for corner in range(8):
                     cx, cy, cz = corner & 1, (corner >> 1) & 1, corner >> 2
                     weight = (
-                        (fx if cx else ONE - fx) * (fy if cy else ONE - fy) * (fz if cz else ONE - fz)
+                        (fx if cx else ONE - fx)
+                        * (fy if cy else ONE - fy)
+                        * (fz if cz else ONE - fz)
                     )
                     row = start + _row(is_dense, points, mask, x + cx, y + cy, z + cz)
                     total = multiply_add(_load_pair(table, 2 * row), weight, total)
@@ -83,7 +85,9 @@ def encode_backward(places, grads, resolutions, starts, dense, tasks, out):  # t
                 for corner in range(8):
                     cx, cy, cz = corner & 1, (corner >> 1) & 1, corner >> 2
                     weight = (
-                        (fx if cx else ONE - fx) * (fy if cy else ONE - fy) * (fz if cz else ONE - fz)
+                        (fx if cx else ONE - fx)
+                        * (fy if cy else ONE - fy)
+                        * (fz if cz else ONE - fz)
                     )
                     row = start + _row(is_dense, points, mask, x + cx, y + cy, z + cz)
                     out[row, 0] += weight * first

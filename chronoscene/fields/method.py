@@ -166,7 +166,8 @@ class FieldMethod(ABC):
         share = end + (1 - end) * (1 + math.cos(math.pi * min(progress, 1.0))) / 2
         tables = {name for name in self.network.params if name.startswith("table")}
         return {
-            name: share * (self.config.learning_rate if name in tables else self.config.network_rate)
+            name: share
+            * (self.config.learning_rate if name in tables else self.config.network_rate)
             for name in self.network.params
         }
 
@@ -185,14 +186,12 @@ class FieldMethod(ABC):
         """Copy an array to the device of the field."""
         return to_device(np.ascontiguousarray(array), self.device)
 
-    def march(
-        self, rays: Rays, periods: NDArray[np.int64], jitter: NDArray[np.float32]
-    ) -> Samples:
+    def march(self, rays: Rays, periods: NDArray[np.int64], jitter: NDArray[np.float32]) -> Samples:
         """Place samples on rays."""
         periods = np.minimum(periods, len(self.occupancy.grids[0]) - 1)
         origins = self.box.to_cube(rays.origins)
         fixed = self.occupancy.grids, self.box, self.occupancy.step, self.config.shells
-        return march(origins, rays.directions, periods, jitter, *fixed)  # type: ignore[arg-type]
+        return march(origins, rays.directions, periods, jitter, *fixed)
 
     def draw(self, rays: Rays, samples: Samples, codes: Codes) -> tuple[Drawn, Tensor]:
         """Evaluate the field at samples and sum along the rays; returns mean distances, too."""
@@ -247,9 +246,9 @@ class FieldMethod(ABC):
             images[pixels, 3] = alpha
             distance = reach.cpu().numpy() / np.maximum(alpha, 1e-9)
             images[pixels, 4] = np.where(alpha > 0, distance, 0) * rays.depths * self.box.half
-        images = images.reshape(view.height, view.width, 5)
-        rgb, alpha = images[..., :3].clip(0, 1), images[..., 3].clip(0, 1)
-        return Prediction(rgb=rgb.copy(), alpha=alpha.copy(), depth=images[..., 4].copy())
+        found = images.reshape(view.height, view.width, 5)
+        rgb, alpha = found[..., :3].clip(0, 1), found[..., 3].clip(0, 1)
+        return Prediction(rgb=rgb.copy(), alpha=alpha.copy(), depth=found[..., 4].copy())
 
     def nearest_period(self, period: float) -> int:
         """Return the whole period whose occupied cells serve a fractional one."""
@@ -295,13 +294,6 @@ class FieldMethod(ABC):
             raise _misfit(folder, "tensors and a description that fit together", error) from error
         self.optimizer = None
 
-    def training_state(self) -> dict[str, Tensor]:
-        """Return further tensors that the steps to come depend on."""
-        return {}
-
-    def restore_state(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from what `training_state` gave."""
-
     def save_training(self, folder: Path) -> None:
         assert self.optimizer is not None, "setup comes first"
         tensors = {f"param.{name}": tensor for name, tensor in self.network.params.items()}
@@ -309,7 +301,6 @@ class FieldMethod(ABC):
         for i, name in enumerate(_GRIDS):
             tensors[f"density.{name}"] = torch.from_numpy(self.occupancy.densities[i])
             tensors[f"grid.{name}"] = torch.from_numpy(self.occupancy.grids[i])
-        tensors |= {f"more.{name}": tensor for name, tensor in self.training_state().items()}
         meta = {"method": self.name, "version": self.version, "rays": self.num_rays}
         save_tensors(folder, tensors, meta, stem=TRAINING)
 
@@ -323,7 +314,6 @@ class FieldMethod(ABC):
             for i, name in enumerate(_GRIDS):
                 self.occupancy.densities[i][:] = tensors[f"density.{name}"].numpy()
                 self.occupancy.grids[i][:] = tensors[f"grid.{name}"].numpy()
-            self.restore_state(parts(tensors, "more"))
         except (KeyError, RuntimeError, ShapeError, ValueError) as error:
             expected = f"a training that {self.name} {self.version} can go on with"
             raise _misfit(folder, expected, error) from error
@@ -333,7 +323,9 @@ class FieldMethod(ABC):
         params = self.network.params
         packed = sum((grid.size + 7) // 8 for grid in self.occupancy.grids)
         unit = "grid rows" if "table" in params else "weights"
-        count = len(params["table"]) if "table" in params else sum(p.numel() for p in params.values())
+        count = (
+            len(params["table"]) if "table" in params else sum(p.numel() for p in params.values())
+        )
         return MethodSize(count, sum(p.numel() for p in params.values()) + packed, unit)
 
 

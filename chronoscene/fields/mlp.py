@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch import Tensor
 from chronoscene.checks import check_shape
 from chronoscene.fields.mlp_kernels import Layers, mlp_backward, mlp_forward
 from chronoscene.kernels.matmul import PADDING
-from chronoscene.training.devices import has_kernels
+from chronoscene.training import devices
 
 Activation = Literal["none", "sigmoid"]
 _CHUNK_ROWS = 1024  # At least, but for the last chunk
@@ -65,15 +66,15 @@ def mlp(
     check_shape("x", x, (int(groups.starts[-1]), None))
     check_shape("shared", shared, (len(groups.starts) - 1, None))
     check_shape("first layer", layers[0], (None, x.shape[1] + shared.shape[1]))
-    if has_kernels(x, shared, *layers):
-        return _Mlp.apply(x, shared, groups, output, *layers)  # type: ignore[no-any-return]
+    if devices.has_kernels(x, shared, *layers):
+        return _Mlp.apply(x, shared, groups, output, *layers)
     return mlp_reference(x, shared, groups, layers, output)
 
 
 def initial_layers(widths: Sequence[int], generator: torch.Generator) -> list[Tensor]:
     """Draw matrices uniformly (Glorot and Bengio 2010), with biases of zero."""
     layers = []
-    for inputs, outputs in zip(widths, widths[1:], strict=False):
+    for inputs, outputs in pairwise(widths):
         bound = (6 / (inputs + outputs)) ** 0.5
         layers.append((2 * torch.rand(outputs, inputs, generator=generator) - 1) * bound)
         layers.append(torch.zeros(outputs))
@@ -89,7 +90,7 @@ def _describe(inputs: int, shared: int, layers: Sequence[Tensor], sigmoid: bool)
     depth = len(layers) // 2
     widths = [_padded(inputs), *(_padded(len(m)) for m in layers[::2])]
     shared_pad = _padded(shared)
-    sizes = [a * b for a, b in zip(widths, widths[1:], strict=False)] + [shared_pad * widths[1]]
+    sizes = [a * b for a, b in pairwise(widths)] + [shared_pad * widths[1]]
     ends = np.cumsum([*sizes, *widths[1:], *sizes])
     places = np.concatenate(([0], ends[:-1])).astype(np.int64)
     hidden = np.concatenate(([0], np.cumsum(widths[1:-1]))).astype(np.int64)
@@ -113,7 +114,10 @@ def _pack(about: Layers, layers: Sequence[Tensor]) -> NDArray[np.float32]:
     """Write all weights where `Layers` says."""
     weights = np.zeros(2 * about.size, np.float32)
     for at, shape, part in _matrices(about, layers):
-        for place, matrix, size in ((about.matrix, part.T, shape), (about.transposed, part, shape[::-1])):
+        for place, matrix, size in (
+            (about.matrix, part.T, shape),
+            (about.transposed, part, shape[::-1]),
+        ):
             target = weights[place[at] : place[at] + size[0] * size[1]].reshape(size)
             target[: matrix.shape[0], : matrix.shape[1]] = matrix
     for at, bias in enumerate(layers[1::2]):
@@ -162,8 +166,8 @@ class _Mlp(torch.autograd.Function):
     ) -> Tensor:
         about = _describe(x.shape[1], shared.shape[1], layers, output == "sigmoid")
         starts = groups.starts.numpy()
-        fixed = (about, _pack(about, layers), _flat(x), _flat(shared), starts)
-        fixed = (*fixed, groups.of_row.numpy(), _chunks(starts, about.size))
+        places = starts, groups.of_row.numpy(), _chunks(starts, about.size)
+        fixed = about, _pack(about, layers), _flat(x), _flat(shared), *places
         learns = any(ctx.needs_input_grad)
         acts = np.empty(len(x) * about.row if learns else 0, np.float32)
         out = torch.empty(len(x), about.outputs)

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 from numba import prange
 from numpy import empty, float32
+from numpy.typing import NDArray
 
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.matmul import product, relu_product
@@ -27,20 +29,19 @@ ONE = float32(1)
 class Layers(NamedTuple):
     """Sizes of a network, and where its weights lie in one flat array; int64 arrays.
 
-    Layer l has the matrix [inputs, outputs] of `widths[l]` and `widths[l + 1]`, padded, at `matrix`
-    and its transpose at `transposed`; `bias` follows. The shared part of the first layer is
-    ``matrix[-1]``.
+    Layer l has a matrix of `widths` [l, l + 1] at `matrix`, its transpose at `transposed`, and a
+    bias. The shared part of the first layer is the last of the matrices.
     """
 
-    widths: object
+    widths: NDArray[np.int64]
     """Padded widths: of the input, of each hidden layer, of the output. [K + 1]"""
-    matrix: object
+    matrix: NDArray[np.int64]
     """[K + 1]"""
-    transposed: object
+    transposed: NDArray[np.int64]
     """[K + 1]"""
-    bias: object
+    bias: NDArray[np.int64]
     """[K]"""
-    hidden: object
+    hidden: NDArray[np.int64]
     """Place of each hidden layer in a row of the activations. [K]"""
     inputs: int
     outputs: int
@@ -105,11 +106,11 @@ def mlp_forward(layers, weights, x, shared, starts, groups, chunks, acts, out): 
             count = min(BLOCK, starts[last] - row)
             left, right = work, other
             _copy_rows(x, row, layers.inputs, left, layers.widths[0], count)
-            for l in range(depth):
-                inputs, outputs = layers.widths[l], layers.widths[l + 1]
-                matrix = (weights, layers.matrix[l], outputs)
+            for layer in range(depth):
+                inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
+                matrix = (weights, layers.matrix[layer], outputs)
                 a, into = (left, 0, inputs, 1), (right, 0, outputs)
-                if l == 0:
+                if layer == 0:
                     for i in range(BLOCK):
                         place = (groups[row + min(i, count - 1)] - first) * hidden
                         for c in range(0, hidden, LANES):
@@ -118,15 +119,15 @@ def mlp_forward(layers, weights, x, shared, starts, groups, chunks, acts, out): 
                         product(a, matrix, into, into, BLOCK, outputs, inputs)
                     else:
                         relu_product(a, matrix, into, into, BLOCK, outputs, inputs)
-                elif l == depth - 1:
-                    bias = (weights, layers.bias[l], 0)
+                elif layer == depth - 1:
+                    bias = (weights, layers.bias[layer], 0)
                     product(a, matrix, bias, into, BLOCK, outputs, inputs)
                 else:
-                    bias = (weights, layers.bias[l], 0)
+                    bias = (weights, layers.bias[layer], 0)
                     relu_product(a, matrix, bias, into, BLOCK, outputs, inputs)
-                if keep and l < depth - 1:
+                if keep and layer < depth - 1:
                     for i in range(count):
-                        at = (row + i) * layers.row + layers.hidden[l]
+                        at = (row + i) * layers.row + layers.hidden[layer]
                         for c in range(0, outputs, LANES):
                             store(acts, at + c, load(right, i * outputs + c))
                 left, right = right, left
@@ -222,20 +223,20 @@ def mlp_backward(  # type: ignore[no-untyped-def]
             d, before = current, other
             if not _output_gradient(layers, out, grads, row, count, d):
                 continue
-            for l in range(depth - 1, -1, -1):
-                inputs, outputs = layers.widths[l], layers.widths[l + 1]
-                if l == 0:
+            for layer in range(depth - 1, -1, -1):
+                inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
+                if layer == 0:
                     _copy_rows(x, row, layers.inputs, work, inputs, count)
                 else:
                     for i in range(count):
-                        at = (row + i) * layers.row + layers.hidden[l - 1]
+                        at = (row + i) * layers.row + layers.hidden[layer - 1]
                         for c in range(0, inputs, LANES):
                             store(work, i * inputs + c, load(acts, at + c))
                     set_zero(work, count * inputs, BLOCK * inputs)
-                into = (part, layers.matrix[l], outputs)
+                into = (part, layers.matrix[layer], outputs)
                 product((work, 0, 1, inputs), (d, 0, outputs), into, into, inputs, outputs, BLOCK)
-                if l:
-                    _column_sums(d, outputs, part, layers.bias[l])
+                if layer:
+                    _column_sums(d, outputs, part, layers.bias[layer])
                 else:
                     for i in range(count):
                         place = (groups[row + i] - first) * hidden
@@ -243,9 +244,9 @@ def mlp_backward(  # type: ignore[no-untyped-def]
                             total = load(common, place + c) + load(d, i * hidden + c)
                             store(common, place + c, total)
                 set_zero(before, 0, BLOCK * inputs)
-                back, rows = (weights, layers.transposed[l], inputs), (before, 0, inputs)
+                back, rows = (weights, layers.transposed[layer], inputs), (before, 0, inputs)
                 product((d, 0, outputs, 1), back, rows, rows, BLOCK, inputs, outputs)
-                if l:
+                if layer:
                     zero = splat(ZERO)
                     for i in range(0, BLOCK * inputs, LANES):
                         value = select(zero < load(work, i), load(before, i), zero)
@@ -264,4 +265,3 @@ def mlp_backward(  # type: ignore[no-untyped-def]
             for chunk in range(1, len(chunks) - 1):
                 total += partial[chunk, i]
             partial[0, i] = total
-

@@ -56,7 +56,9 @@ class FieldNetwork:
         grid = config.encoding == "grid"
         width = config.layout.width if grid else 3 + 6 * config.frequencies
         hidden = [config.hidden] * config.layers
-        params = named("density", initial_layers((width + geometry, *hidden, config.features), generator))
+        params = named(
+            "density", initial_layers((width + geometry, *hidden, config.features), generator)
+        )
         inputs = config.features + DIRECTION_SIZE + color
         widths = (inputs, config.hidden, config.hidden, 3)
         params |= named("color", initial_layers(widths, generator))

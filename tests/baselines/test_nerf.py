@@ -19,7 +19,9 @@ SMALL = {"samples": 2_048, "levels": 4, "log2_rows": 12, "finest": 64, "hidden":
 @pytest.fixture(scope="module")
 def neusc() -> Any:
     spec = load_spec("neusc")
-    method: FieldMethod = import_object(spec.method)(build_config(spec, preset="fast", overrides=SMALL))
+    method: FieldMethod = import_object(spec.method)(
+        build_config(spec, preset="fast", overrides=SMALL)
+    )
     method.setup(make_training_set(3), seed=0, device="cpu")
     for i in range(3):
         method.step(i, i / 3)

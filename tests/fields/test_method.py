@@ -162,8 +162,12 @@ def test_rays_meet_their_pixels() -> None:
 
 
 def test_contraction_keeps_the_cube_and_reaches_everything() -> None:
-    assert contract.py_func(np.float32(0.5), np.float32(-1), np.float32(0)) == pytest.approx((0.625, 0.25, 0.5))
-    assert contract.py_func(np.float32(1e6), np.float32(0), np.float32(0)) == pytest.approx((1, 0.5, 0.5), abs=1e-5)
+    assert contract.py_func(np.float32(0.5), np.float32(-1), np.float32(0)) == pytest.approx(
+        (0.625, 0.25, 0.5)
+    )
+    assert contract.py_func(np.float32(1e6), np.float32(0), np.float32(0)) == pytest.approx(
+        (1, 0.5, 0.5), abs=1e-5
+    )
 
 
 def test_occupancy_begins_where_points_are() -> None:
@@ -206,4 +210,3 @@ def test_uncertainty_of_one_leaves_the_squared_error() -> None:
     rays = method.pool.draw(np.random.default_rng(0), 5)
     error = (drawn.rgb - torch.from_numpy(rays.colors)).square().mean()
     assert float(method.loss(drawn, rays, 0.0)) == pytest.approx(float(error / 2 + 3), rel=1e-6)
-

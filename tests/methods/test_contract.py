@@ -11,11 +11,16 @@ import pytest
 from chronoscene.harness.contract import CHECKS
 from chronoscene.harness.contract.subject import PAUSE, NotApplicableError, Subject
 from chronoscene.harness.contract.tiny_training import STEPS
-from chronoscene.methods import method_names
+from chronoscene.methods import load_spec, method_names
 from chronoscene.training.photometric import _PhotometricLoss
 
 
-@pytest.fixture(scope="module", params=method_names())
+def _cost(name):
+    """Radiance fields take long; ``tests/fields`` has what is quick of the rules."""
+    return pytest.param(name, marks=pytest.mark.slow) if load_spec(name).mixes_views else name
+
+
+@pytest.fixture(scope="module", params=[_cost(name) for name in method_names()])
 def subject(request, tmp_path_factory):
     return Subject(request.param, tmp_path_factory.mktemp(request.param))
 
@@ -34,6 +39,8 @@ def test_saving_a_training_and_a_step_that_is_not_finite_change_nothing(
     """The step counts as a drawn view, and nothing else of the training is different."""
     if not subject.spec.resumable:
         pytest.skip("the method cannot be resumed")
+    if subject.spec.mixes_views:
+        pytest.skip("its steps have no photo and no loss of photos")
     method = subject.resumed(subject.interrupted)
     backward = _PhotometricLoss.backward
 
