@@ -21,10 +21,10 @@ class ContinualConfig(FieldConfig):
     appearance_size: PositiveInt = 48
     """Length of its appearance code."""
     replay: Literal["none", "stored", "rendered"] = "rendered"
-    """What is shown again of earlier periods under ``sequential``: nothing; the photos that were
+    """Replay of earlier periods under ``sequential``: nothing; the photos that were
     kept; all their training views, rendered by the model as it was, and the kept photos."""
     buffer: NonNegativeInt = 10
     """Photos of earlier periods that are kept, chosen by a reservoir."""
     start: Literal["fresh", "warm"] = "fresh"
-    """Whether a new period begins with a new network, as in the official code, where all that is
+    """Start of a new period: with a new network, as in the official code, where all that is
     known of earlier ones passes through the replay; or with the model so far."""

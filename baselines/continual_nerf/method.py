@@ -15,7 +15,6 @@ from chronoscene.fields.method import FieldMethod
 from chronoscene.fields.network import Codes
 from chronoscene.fields.rays import PixelPool, Rays
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
-from chronoscene.methods.interface import no_mask
 from chronoscene.training.periods import with_new_periods
 
 _RESERVOIR = 1_002  # Numbers of random draws, after the seed
@@ -27,7 +26,7 @@ LoadMask = Callable[[int], NDArray[np.bool_] | None]
 
 @dataclass
 class Memory:
-    """What is left of earlier periods: cameras, and a few photos."""
+    """Remains of earlier periods: cameras, and a few photos."""
 
     views: tuple[TrainingView, ...] = ()
     photos: dict[int, tuple[NDArray[np.uint8], NDArray[np.bool_] | None]] = field(
@@ -136,7 +135,7 @@ class CLNeRF(FieldMethod):
         def load_mask(i: int) -> NDArray[np.bool_] | None:
             if i >= len(old):
                 return train.load_mask(i - len(old))
-            return photos[old[i]][1] if old[i] in photos else no_mask(i)
+            return photos[old[i]][1] if old[i] in photos else None
 
         return PixelPool(views, load_image, load_mask, seed=self.seed)
 

@@ -24,7 +24,7 @@ def _presets(flags: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Presets of a method, by its flags."""
     return {
         "paper": _PLAIN | flags,
-        "balanced": _GRID | flags | {"iterations": 4_000},
+        "balanced": _GRID | flags | {"iterations": 3_000},
         "fast": _GRID | flags | {"iterations": 1_000, "samples": 32_768, "finest": 2_048},
     }
 
@@ -37,7 +37,8 @@ _COMMON: dict[str, Any] = {
     "learns_background": True,
     "resumable": True,
     "main_options": (
-        "iterations", "samples", "encoding", "log2_rows", "finest", "learning_rate"
+        "iterations", "samples", "encoding", "log2_rows", "finest", "cells", "shells",
+        "learning_rate", "network_rate", "opacity_weight",
     ),
     "search": {"learning_rate": Range(1e-3, 3e-2), "log2_rows": Range(15, 19, "int")},
 }  # fmt: skip

@@ -16,12 +16,12 @@ class NerfConfig(FieldConfig):
 
     opacity_weight: NonNegativeFloat = 0.0
     time: Literal["none", "frequencies", "steps"] = "none"
-    """How colours depend on the time t = period / (T - 1): not; by sines and cosines of it
+    """Dependence of colours on the time t = period / (T - 1): not; by sines and cosines of it
     (NeRF-T); by learned step functions, so that content switches (NeuSC)."""
     appearance: Literal["none", "image"] = "none"
     """``image``: a learned code of the light for each photo."""
     transient: Literal["none", "density", "mask"] = "none"
-    """What is only in one photo: nothing; a density and an uncertainty that are left out of renders
+    """Treatment of what is only in one photo: nothing; a density and an uncertainty that are left out of renders
     (NeRF-W); a mask of the photo that weakens the loss (NeuSC, Ha-NeRF)."""
     activation: Literal["exp", "softplus"] = "exp"
     """From the output of the network to a density."""

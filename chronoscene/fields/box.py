@@ -30,7 +30,7 @@ class SceneBox:
     """Box around the sparse points, in a cube whose coordinates run from -1 to 1."""
 
     centre: tuple[float, float, float]
-    """Of the cube, in the training frame."""
+    """Centre of the cube, in the training frame."""
     half: float
     """Half an edge of the cube, in units of the training frame."""
     sides: tuple[float, float, float]

@@ -48,11 +48,11 @@ class FieldConfig:
     shells: PositiveInt = 8
     """Samples of a ray outside of the box of the scene, at most."""
     learning_rate: PositiveFloat = 1e-2
-    """Of Adam at the start."""
+    """Learning rate of tables at the start."""
     network_rate: PositiveFloat = 1e-2
-    """Of the networks and codes."""
+    """Learning rate of networks and codes at the start."""
     final_share: PositiveFloat = 1 / 30
-    """What is left of the learning rates at the end; they fall by a cosine."""
+    """Share of the learning rates that is left at the end; they fall by a cosine."""
     opacity_weight: NonNegativeFloat = 1e-3
     """Weight of the entropy -o log o of the rays' opacities o in the loss."""
 

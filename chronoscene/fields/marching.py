@@ -40,7 +40,7 @@ def march(
     directions: NDArray[np.float32],
     periods: NDArray[np.int64],
     jitter: NDArray[np.float32],
-    grids: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    grids: tuple[NDArray[np.uint8], ...],
     box: SceneBox,
     step: float,
     shells: int,

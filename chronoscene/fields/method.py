@@ -37,7 +37,7 @@ _GRIDS = ("inside", "outside")
 
 
 class Drawn:
-    """What rays show: sums along them, and what the loss needs besides."""
+    """Outcome of some rays: sums along them, and what the loss needs besides."""
 
     def __init__(self, sums: Tensor, opacities: Tensor, background: Tensor) -> None:
         self.values = sums
@@ -63,7 +63,7 @@ class FieldMethod(ABC):
     version: ClassVar[str] = "1"
     """Version of the implementation; stored with every model."""
     geometry_varies: ClassVar[bool] = True
-    """Whether densities depend on the period, so that each has an occupancy grid of its own."""
+    """True if densities depend on the period, so that each has an occupancy grid of its own."""
     network_class: ClassVar[type[FieldNetwork]] = FieldNetwork
 
     def __init__(self, config: FieldConfig) -> None:
@@ -148,7 +148,7 @@ class FieldMethod(ABC):
         drawn, _ = self.draw(rays, samples, self.codes(rays))
         loss = self.loss(drawn, rays, progress)
         self.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         self._adapt_rays(len(samples.lengths))
         # What is not finite in a table comes from the networks behind it.
         gradients = self.optimizer.gradients().items()

@@ -53,7 +53,7 @@ class Layers(NamedTuple):
     size: int
     """Numbers of all weights without the transposes: they come last."""
     sigmoid: bool
-    """Whether the output goes through the logistic function."""
+    """True if the output goes through the logistic function."""
 
 
 @inner

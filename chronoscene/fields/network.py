@@ -15,13 +15,13 @@ from chronoscene.fields.mlp import Activation, Groups, initial_layers, mlp
 from chronoscene.training.spherical_harmonics import basis
 
 DIRECTION_DEGREE = 3
-"""Of the spherical harmonics of a direction: 16 numbers."""
+"""Degree of the spherical harmonics of a direction: 16 numbers."""
 DIRECTION_SIZE = (DIRECTION_DEGREE + 1) ** 2
 _SHIFT = 1.0  # Logarithm of the density that a training starts with, per half edge of the cube
 
 
 class Codes(NamedTuple):
-    """What a ray brings along, besides its direction."""
+    """Input that a ray brings along, besides its direction."""
 
     geometry: Tensor
     """[R, G]"""

@@ -15,7 +15,6 @@ from chronoscene.methods import load_spec, method_names
 from chronoscene.training import photometric
 from chronoscene.training.checkpoint import load_tensors
 
-
 SPLATS = [name for name in method_names() if not load_spec(name).mixes_views]
 """Methods that draw one view in a step."""
 
