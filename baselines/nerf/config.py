@@ -21,8 +21,8 @@ class NerfConfig(FieldConfig):
     appearance: Literal["none", "image"] = "none"
     """``image``: a learned code of the light for each photo."""
     transient: Literal["none", "density", "mask"] = "none"
-    """Treatment of what is only in one photo: nothing; a density and an uncertainty that are left out of renders
-    (NeRF-W); a mask of the photo that weakens the loss (NeuSC, Ha-NeRF)."""
+    """Treatment of what is only in one photo: none; a density and an uncertainty that are left out
+    of renders (NeRF-W); a mask of the photo that weakens the loss (NeuSC, Ha-NeRF)."""
     activation: Literal["exp", "softplus"] = "exp"
     """From the output of the network to a density."""
     time_frequencies: PositiveInt = 4
