@@ -25,6 +25,9 @@ class ContinualConfig(FieldConfig):
     kept; all their training views, rendered by the model as it was, and the kept photos."""
     buffer: NonNegativeInt = 10
     """Photos of earlier periods that are kept, chosen by a reservoir."""
+    replay_loss: Literal["squared", "charbonnier"] = "squared"
+    """Error of replayed rays: as of new ones; or sqrt(d^2 + 1e-6) with a weight that rises from 0
+    to 1 over the period (MEIL-NeRF)."""
     start: Literal["fresh", "warm"] = "fresh"
     """Start of a new period: with a new network, as in the official code, where all that is
     known of earlier ones passes through the replay; or with the model so far."""

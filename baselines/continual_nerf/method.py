@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from baselines.continual_nerf.config import ContinualConfig
-from chronoscene.fields.method import FieldMethod
+from chronoscene.fields.method import Drawn, FieldMethod
 from chronoscene.fields.network import Codes
 from chronoscene.fields.rays import PixelPool, Rays
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
@@ -19,6 +20,7 @@ from chronoscene.training.periods import with_new_periods
 
 _RESERVOIR = 1_002  # Numbers of random draws, after the seed
 _FRESH = 1_003
+_CHARBONNIER = 1e-6  # Added to the square
 
 LoadImage = Callable[[int], NDArray[np.uint8]]
 LoadMask = Callable[[int], NDArray[np.bool_] | None]
@@ -73,6 +75,7 @@ class CLNeRF(FieldMethod):
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
         super().setup(train, seed=seed, device=device)
         self.memory = Memory()
+        self.replayed = 0
         self.train = train
         self._fresh: dict[str, Tensor] | None = None
 
@@ -95,6 +98,17 @@ class CLNeRF(FieldMethod):
             self.mixed(params["geometry"], geometry_period),
             self.mixed(params["appearance"], appearance_period),
         )
+
+    def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:
+        """Return the loss; with that of MEIL-NeRF, replayed rays have an error of their own."""
+        loss = super().loss(drawn, rays, progress)
+        if self.config.replay_loss == "squared" or self.replayed == 0:
+            return loss
+        squares = (drawn.rgb - self.tensor(rays.colors)).square()
+        old = self.tensor((rays.views < self.replayed).astype(np.float32))[:, None]
+        weight = (1 + math.cos(math.pi * (1 + progress))) / 2
+        robust = weight * torch.sqrt(squares + _CHARBONNIER)
+        return loss + (old * (robust - squares)).mean()
 
     def extend(self, train: TrainingSet) -> None:
         """Render or keep what is to be shown again, then go on with a further period."""
@@ -121,6 +135,7 @@ class CLNeRF(FieldMethod):
     def _pool_with_replay(self, train: TrainingSet) -> PixelPool:
         """Pixels of the new photos, and of what is replayed."""
         old = self._replayed()
+        self.replayed = len(old)
         views = (*(self.memory.views[i] for i in old), *train.views)
         photos = self.memory.photos
 
@@ -145,3 +160,13 @@ class CLNeRF(FieldMethod):
             return []
         every = range(len(self.memory.views))
         return [i for i in every if self.config.replay == "rendered" or i in self.memory.photos]
+
+
+class MEILNeRF(CLNeRF):
+    """The same with the replay loss of MEIL-NeRF, as the repository of CLNeRF has it.
+
+    Source: Chung et al. 2022, "MEIL-NeRF: Memory-Efficient Incremental Learning of Neural Radiance
+    Fields"; its learned generator of rays is not part of that code, nor of this.
+    """
+
+    name = "meil-nerf"

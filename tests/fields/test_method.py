@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from baselines.continual_nerf.method import Memory
 from chronoscene.fields.box import box_of, contract
-from chronoscene.fields.method import FieldMethod
+from chronoscene.fields.method import Drawn, FieldMethod
 from chronoscene.fields.occupancy import start_occupancy
 from chronoscene.fields.rays import PixelPool, view_rays
 from chronoscene.harness.contract.tiny_training import make_stage
@@ -134,10 +135,23 @@ def test_what_is_replayed() -> None:
     assert counts == {"none": 0, "stored": 2, "rendered": len(first.views)}
 
 
+def test_replayed_rays_weigh_more_and_more_in_meil_nerf() -> None:
+    first, second = (make_stage(i, hide_period=False) for i in range(2))
+    method = begun("meil-nerf", first, opacity_weight=0.0)
+    method.extend(second)
+    rays = method.pool.draw(np.random.default_rng(0), 64)
+    values = torch.zeros(64, 3)
+    drawn = Drawn(values, torch.ones(64), method.background)
+    squares = torch.from_numpy(rays.colors).square()
+    old = torch.from_numpy(rays.views < len(first.views))[:, None]
+    assert 10 < int(old.sum()) < 54
+    for progress, weight in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
+        expected = torch.where(old, weight * torch.sqrt(squares + 1e-6), squares).mean()
+        assert float(method.loss(drawn, rays, progress)) == pytest.approx(float(expected), rel=1e-5)
+
+
 def test_each_photo_is_kept_with_equal_probability() -> None:
     """After n photos each is in the reservoir of r with the probability r / n."""
-    from baselines.continual_nerf.method import Memory
-
     data = make_stage(0, hide_period=False)
     kept = np.zeros(2 * len(data.views))
     for seed in range(400):
@@ -203,8 +217,6 @@ def test_a_photo_of_transient_things_alone_is_not_rendered() -> None:
 
 def test_uncertainty_of_one_leaves_the_squared_error() -> None:
     method = begun("nerf-w", make_training_set(1), least_uncertainty=1.0, transient_weight=0.0)
-    from chronoscene.fields.method import Drawn
-
     values = torch.cat((torch.rand(5, 3), torch.zeros(5, 2)), dim=1)
     drawn = Drawn(values, torch.ones(5), method.background)
     rays = method.pool.draw(np.random.default_rng(0), 5)
