@@ -12,7 +12,7 @@ _SHORT: dict[str, Any] = {"log2_rows": 17, "samples": 65_536, "start": "warm"}
 def _presets(flags: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Presets of a method, by its flags."""
     return {
-        "paper": flags,
+        "paper": flags | {"network_rate": 1e-2},
         "balanced": _SHORT | flags | {"iterations": 3_000},
         "fast": _SHORT | flags | {"iterations": 1_000, "samples": 32_768, "finest": 2_048},
     }

@@ -34,7 +34,7 @@ class NerfNetwork(FieldNetwork):
         params = cls.initial(config, 0, color, generator)
         if config.transient == "density":
             widths = (config.features + config.transient_size, config.hidden, TRANSIENT_OUTPUTS)
-            params |= named("transient", initial_layers(widths, generator))
+            params |= named("transient", initial_layers(widths, generator), biases=False)
         return params
 
     def density(self, places: Tensor, groups: Groups, geometry: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,10 +79,11 @@ class ContentNetwork(NerfNetwork):
         if position:
             params["table_content"] = config.layout.initial_table(generator)
         widths = (width + position + time_size(config), hidden, hidden)
-        params |= named("content", initial_layers(widths, generator))
-        params |= named("content_rgb", initial_layers((hidden, hidden, 3), generator))
+        params |= named("content", initial_layers(widths, generator), biases=not position)
+        widths = (hidden, hidden, 3)
+        params |= named("content_rgb", initial_layers(widths, generator), biases=not position)
         widths = (hidden + 3 + config.appearance_size, hidden, 3)
-        return params | named("light", initial_layers(widths, generator))
+        return params | named("light", initial_layers(widths, generator), biases=not position)
 
     def values(
         self, features: Tensor, places: Tensor, groups: Groups, directions: Tensor, color: Tensor

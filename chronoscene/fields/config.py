@@ -49,7 +49,7 @@ class FieldConfig:
     """Samples of a ray outside of the box of the scene, at most."""
     learning_rate: PositiveFloat = 1e-2
     """Learning rate of tables at the start."""
-    network_rate: PositiveFloat = 1e-2
+    network_rate: PositiveFloat = 5e-3
     """Learning rate of networks and codes at the start."""
     final_share: PositiveFloat = 1 / 30
     """Share of the learning rates that is left at the end; they fall by a cosine."""

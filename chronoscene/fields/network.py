@@ -56,18 +56,21 @@ class FieldNetwork:
         grid = config.encoding == "grid"
         width = config.layout.width if grid else 3 + 6 * config.frequencies
         hidden = [config.hidden] * config.layers
-        params = named(
-            "density", initial_layers((width + geometry, *hidden, config.features), generator)
-        )
+        # Biases, which all places share, would be learned first, and switch hidden units off.
+        widths = (width + geometry, *hidden, config.features)
+        params = named("density", initial_layers(widths, generator), biases=not grid)
         inputs = config.features + DIRECTION_SIZE + color
         widths = (inputs, config.hidden, config.hidden, 3)
-        params |= named("color", initial_layers(widths, generator))
+        params |= named("color", initial_layers(widths, generator), biases=not grid)
         return params | ({"table": config.layout.initial_table(generator)} if grid else {})
 
     def layers(self, name: str) -> list[Tensor]:
-        """Return matrices and biases of a network."""
-        count = sum(key.startswith(f"{name}.") for key in self.params)
-        return [self.params[f"{name}.{i}"] for i in range(count)]
+        """Return matrices and biases of a network; biases that it does not have are zero."""
+        found: list[Tensor] = []
+        while (matrix := self.params.get(f"{name}.{len(found)}")) is not None:
+            bias = self.params.get(f"{name}.{len(found) + 1}")
+            found += matrix, matrix.new_zeros(len(matrix)) if bias is None else bias
+        return found
 
     def mlp(
         self, name: str, x: Tensor, shared: Tensor, groups: Groups, output: Activation = "none"
@@ -98,9 +101,10 @@ class FieldNetwork:
         return self.mlp("color", features, shared, groups, "sigmoid")
 
 
-def named(prefix: str, layers: list[Tensor]) -> dict[str, Tensor]:
-    """Name the tensors of a network."""
-    return {f"{prefix}.{i}": tensor for i, tensor in enumerate(layers)}
+def named(prefix: str, layers: list[Tensor], *, biases: bool = True) -> dict[str, Tensor]:
+    """Name the tensors of a network, ``<prefix>.<number>``; matrices have the even numbers."""
+    names = enumerate(layers)
+    return {f"{prefix}.{i}": tensor for i, tensor in names if biases or i % 2 == 0}
 
 
 def frequency_code(x: Tensor, count: int) -> Tensor:
