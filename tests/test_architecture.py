@@ -25,7 +25,7 @@ LAYERS = (
     ("chronoscene.harness.files", "chronoscene.harness"),
     ("chronoscene.registration", "chronoscene.figures", "chronoscene.synth"),
     ("chronoscene.statistics", "chronoscene.validation", "chronoscene.download"),
-    ("chronoscene.anchors", "chronoscene.gaussians"),
+    ("chronoscene.anchors", "chronoscene.gaussians", "chronoscene.fields"),
     ("chronoscene.training",),
     ("chronoscene.rasterizer", "chronoscene.metrics"),
     ("chronoscene.convert", "chronoscene.edit", "chronoscene.undistort"),
@@ -40,7 +40,9 @@ LAYERS = (
 )
 """From the top down. A module imports from its own package and from lower layers."""
 
-TORCH_SIDE = {f"chronoscene.{name}" for name in ("anchors", "gaussians", "training", "rasterizer")}
+TORCH_SIDE = {
+    f"chronoscene.{name}" for name in ("anchors", "gaussians", "fields", "training", "rasterizer")
+}
 """Packages that need torch and are used by methods only."""
 
 

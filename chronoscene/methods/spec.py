@@ -105,6 +105,10 @@ class MethodSpec:
     """Preset name to the values that differ from the defaults of the config class."""
     titles: Mapping[str, str] = field(default_factory=dict)
     """Names in tables of presets of which `title` would say too much or too little."""
+    mixes_views: bool = False
+    """True if a step learns from pixels of all views at once: no single one makes it empty."""
+    learns_background: bool = False
+    """True if the model says what is behind everything, so that no view shows the background."""
     per_period: tuple[str, ...] = ()
     """Presets whose iterations are those of each period: each stage of ``sequential`` and each
     model of ``separate`` has all of them, and a model of several periods as often as many."""

@@ -12,24 +12,30 @@ from chronoscene.harness.contract import CHECKS
 from chronoscene.harness.contract.subject import PAUSE, NotApplicableError, Subject, train_elsewhere
 from chronoscene.harness.contract.tiny_training import STEPS
 from chronoscene.harness.contract.training import equal_seeds_give_equal_bytes
-from chronoscene.methods import method_names
+from chronoscene.methods import load_spec, method_names
 from chronoscene.training.photometric import _PhotometricLoss
+
+QUICK = [name for name in method_names() if not load_spec(name).mixes_views]
+"""Radiance fields take long; ``tests/fields`` has what is quick of the rules."""
 
 
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory):
-    """All methods in one process, most of whose time it takes to start."""
-    return train_elsewhere(method_names(), tmp_path_factory.mktemp("elsewhere"))
+    """All quick methods in one process, most of whose time it takes to start."""
+    return train_elsewhere(QUICK, tmp_path_factory.mktemp("elsewhere"))
 
 
-@pytest.fixture(scope="module", params=method_names())
+@pytest.fixture(
+    scope="module",
+    params=[n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in method_names()],
+)
 def subject(request, tmp_path_factory):
     return Subject(request.param, tmp_path_factory.mktemp(request.param))
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_the_contract(subject, check, request):
-    if check is equal_seeds_give_equal_bytes:
+    if check is equal_seeds_give_equal_bytes and subject.name in QUICK:
         subject.elsewhere = request.getfixturevalue("elsewhere")
     try:
         check(subject)
@@ -43,6 +49,8 @@ def test_saving_a_training_and_a_step_that_is_not_finite_change_nothing(
     """The step counts as a drawn view, and nothing else of the training is different."""
     if not subject.spec.resumable:
         pytest.skip("the method cannot be resumed")
+    if subject.spec.mixes_views:
+        pytest.skip("its steps have no photo and no loss of photos")
     method = subject.resumed(subject.interrupted)
     backward = _PhotometricLoss.backward
 

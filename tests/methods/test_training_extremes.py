@@ -25,7 +25,8 @@ of the extremes, each extreme a share of the methods."""
 def pairs():
     for i, extreme in enumerate(CHEAP):
         for j, name in enumerate(method_names()):
-            marks = () if (i + j) % SHARE == 0 else pytest.mark.slow
+            quick = (i + j) % SHARE == 0 and not load_spec(name).mixes_views
+            marks = () if quick else pytest.mark.slow
             yield pytest.param(extreme, name, id=f"{extreme.name}-{name}", marks=marks)
 
 

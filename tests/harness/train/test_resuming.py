@@ -15,7 +15,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import read_run
 from chronoscene.harness.train import worker
 from chronoscene.harness.train.checkpoints import Checkpoints
-from chronoscene.methods import method_names
+from chronoscene.methods import load_spec, method_names
 
 TOY = "toy_methods:DRAWING"
 SCRIPT = """
@@ -120,7 +120,9 @@ def test_a_training_in_stages_that_ends_with_one_goes_on(bench_here, tmp_path, m
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", method_names())
+@pytest.mark.parametrize(
+    "method", [name for name in method_names() if not load_spec(name).mixes_views]
+)
 def test_a_training_that_is_killed_again_and_again(scene_folder, tmp_path, method):
     generator = random.Random(2)
     assert start(scene_folder, method, tmp_path / "whole", 1500, "fast").communicate()

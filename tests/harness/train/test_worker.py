@@ -15,8 +15,11 @@ from chronoscene.methods import load_spec, method_names
 from chronoscene.training import photometric
 from chronoscene.training.checkpoint import load_tensors
 
+SPLATS = [name for name in method_names() if not load_spec(name).mixes_views]
+"""Methods that draw one view in a step."""
 
-@pytest.mark.parametrize("method", method_names())
+
+@pytest.mark.parametrize("method", SPLATS)
 def test_a_photo_that_shows_nothing_is_an_empty_step(make_scene, tmp_path, bench_here, method):
     scene = make_scene()
     blind = next(frame for frame in scene.frames if frame.split == "train")
@@ -32,7 +35,7 @@ def test_a_photo_that_shows_nothing_is_an_empty_step(make_scene, tmp_path, bench
     assert "3 of 15 steps empty: their photos show nothing of the model" in tables
 
 
-@pytest.mark.parametrize("method", method_names())
+@pytest.mark.parametrize("method", [*SPLATS, pytest.param("clnerf", marks=pytest.mark.slow)])
 def test_every_method_learns_one_period_after_the_other(bench_here, method):
     options = {"strategies": ("sequential",), "preset": "fast", "iterations": 16}
     outcome, said = bench_here(method, **options)
@@ -108,7 +111,7 @@ def poison(monkeypatch, numbers):
     monkeypatch.setattr(photometric._PhotometricLoss, "backward", staticmethod(poisoned))
 
 
-@pytest.mark.parametrize("method", method_names())
+@pytest.mark.parametrize("method", SPLATS)
 def test_gradients_that_are_not_finite_cost_their_step_alone(bench_here, monkeypatch, method):
     poison(monkeypatch, (4, 5, 9))
     outcome, _ = bench_here(method, preset="fast", iterations=15)

@@ -1,0 +1,43 @@
+"""Options of NeRF and of what was made of it for photos of many days."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+
+from chronoscene.fields.config import FieldConfig
+
+
+@dataclass(frozen=True)
+class NerfConfig(FieldConfig):
+    """Options of the family; the flags `time`, `appearance` and `transient` make the methods."""
+
+    opacity_weight: NonNegativeFloat = 0.0
+    time: Literal["none", "frequencies", "steps"] = "none"
+    """Dependence of colours on the time t = period / (T - 1): not; by sines and cosines of it
+    (NeRF-T); by learned step functions, so that content switches (NeuSC)."""
+    appearance: Literal["none", "image"] = "none"
+    """``image``: a learned code of the light for each photo."""
+    transient: Literal["none", "density", "mask"] = "none"
+    """Treatment of what is only in one photo: none; a density and an uncertainty that are left out
+    of renders (NeRF-W); a mask of the photo that weakens the loss (NeuSC, Ha-NeRF)."""
+    activation: Literal["exp", "softplus"] = "exp"
+    """From the output of the network to a density."""
+    time_frequencies: PositiveInt = 4
+    """Frequencies of the time."""
+    time_steps: PositiveInt = 16
+    """Step functions of the time."""
+    appearance_size: PositiveInt = 48
+    """Length of the code of a photo's light."""
+    transient_size: PositiveInt = 16
+    """Length of the code of what is only in one photo."""
+    content_weight: NonNegativeFloat = 0.25
+    """Weight of the error of the colours before the light is applied (NeuSC)."""
+    mask_weight: NonNegativeFloat = 0.05
+    """Weight of the squared mask."""
+    least_uncertainty: PositiveFloat = 0.1
+    """Added to the uncertainty of NeRF-W."""
+    transient_weight: NonNegativeFloat = 0.01
+    """Weight of the mean transient density."""

@@ -1,0 +1,164 @@
+"""NeRF and what was made of it for photos of many days, as plug-ins."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from baselines.nerf.config import NerfConfig
+from baselines.nerf.network import ContentNetwork, NerfNetwork
+from baselines.nerf.time import FIRST_WIDTH, step_code, wave_code
+from chronoscene.fields.method import Drawn, FieldMethod
+from chronoscene.fields.mlp import initial_layers, make_groups, mlp
+from chronoscene.fields.network import Codes, FieldNetwork, frequency_code, named
+from chronoscene.fields.rays import Rays
+from chronoscene.methods import TrainingSet
+from chronoscene.training.periods import period_weights
+
+_PIXEL_FREQUENCIES = 10
+_MASK_CODE = 128
+_MASK_HIDDEN = 64
+
+
+class Nerf(FieldMethod):
+    """Static density; colours of the place, and by its flags of the time and of the photo.
+
+    A rendered view has the mean of the light of its period's training photos, so no test photo has
+    a code. README.md beside this file says what differs on purpose from each paper.
+    """
+
+    name = "nerf"
+    network_class: ClassVar[type[FieldNetwork]] = NerfNetwork
+    geometry_varies = False
+    config: NerfConfig
+    network: NerfNetwork
+
+    def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
+        super().setup(train, seed=seed, device=device)
+        self.meta["image_periods"] = [view.period for view in train.views]
+
+    def initial(self, train: TrainingSet, generator: torch.Generator) -> dict[str, Tensor]:
+        config, images = self.config, len(train.views)
+        network = self.network_class
+        assert issubclass(network, NerfNetwork)
+        params = network.begin(config, generator)
+        if config.time == "steps":
+            params["step_centres"] = torch.rand(config.time_steps, generator=generator)
+            params["step_widths"] = torch.full((config.time_steps,), FIRST_WIDTH)
+        if config.appearance == "image":
+            params["light_codes"] = _codes(images, config.appearance_size, generator)
+        if config.transient == "density":
+            params["transient_codes"] = _codes(images, config.transient_size, generator)
+        if config.transient == "mask":
+            params["mask_codes"] = _codes(images, _MASK_CODE, generator)
+            widths = 2 * (1 + 2 * _PIXEL_FREQUENCIES) + _MASK_CODE, *(4 * [_MASK_HIDDEN]), 1
+            params |= named("mask", initial_layers(widths, generator))
+        return params
+
+    def time_code(self, times: Tensor) -> Tensor:
+        """Return the code of times 0..1. [R] -> [R, E]"""
+        params = self.network.params
+        if self.config.time == "steps":
+            return step_code(times, params["step_centres"], params["step_widths"])
+        if self.config.time == "frequencies":
+            return wave_code(times, self.config.time_frequencies)
+        return torch.zeros(len(times), 0, device=times.device)
+
+    def times(self, periods: np.ndarray) -> Tensor:
+        """Return the times of periods, 0 at the first and 1 at the last. [R]"""
+        last = max(int(self.meta["num_periods"]) - 1, 1)
+        return self.tensor((periods / last).astype(np.float32))
+
+    def codes(self, rays: Rays) -> Codes:
+        views, params = self.tensor(rays.views), self.network.params
+        every = self.time_code(self.times(np.arange(int(self.meta["num_periods"]))))
+        color = every.index_select(0, self.tensor(self.pool.periods[rays.views]))
+        if "light_codes" in params:
+            color = torch.cat((color, params["light_codes"].index_select(0, views)), dim=1)
+        geometry = torch.zeros(len(views), 0, device=views.device)
+        if "transient_codes" in params:
+            geometry = params["transient_codes"].index_select(0, views)
+        return Codes(geometry, color)
+
+    def view_codes(self, geometry_period: float, appearance_period: float) -> Codes:
+        """Return the codes of a view; no transient things."""
+        weights = period_weights(appearance_period, int(self.meta["num_periods"]))
+        color = self.time_code(self.times(np.array([appearance_period])))
+        if "light_codes" in self.network.params:
+            periods = np.array(self.meta["image_periods"])
+            counts = np.bincount(periods, minlength=len(weights))
+            shares = self.tensor((weights / np.maximum(counts, 1))[periods].astype(np.float32))
+            lights = self.network.params["light_codes"]
+            light = (shares[:, None] * lights).sum(0, keepdim=True) / shares.sum()
+            color = torch.cat((color, light), dim=1)
+        return Codes(color[:, :0], color)
+
+    def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:
+        target = self.tensor(rays.colors)
+        squares = (drawn.rgb - target).square()
+        if self.config.transient == "density":
+            return self._uncertain_loss(squares, drawn)
+        loss = super().loss(drawn, rays, progress)
+        if self.config.transient == "mask":
+            mask = self._masks(rays)
+            kept = 1 - mask
+            loss = 0.5 * (kept * squares).mean() + self.config.mask_weight * mask.square().mean()
+            kept = kept.detach()
+        else:
+            kept = torch.ones_like(squares[:, :1])
+        if self.config.time == "steps":
+            clear = (1 - drawn.opacities)[:, None] * self.background
+            content = drawn.values[:, 3:6] + clear
+            loss = loss + self.config.content_weight * (kept * (content - target).square()).mean()
+        return loss
+
+    def _uncertain_loss(self, squares: Tensor, drawn: Drawn) -> Tensor:
+        """Error over the uncertainty of each ray, as in NeRF-W, equation 13."""
+        beta = drawn.values[:, 3] + self.config.least_uncertainty
+        error = (squares / (2 * beta.square())[:, None]).mean()
+        return (
+            error
+            + 3
+            + torch.log(beta).mean()
+            + self.config.transient_weight * drawn.values[:, 4].mean()
+        )
+
+    def _masks(self, rays: Rays) -> Tensor:
+        """Return how much of what rays show is in their photo alone, 0..1. [R, 1]"""
+        views = self.tensor(rays.views)
+        codes = self.network.params["mask_codes"].index_select(0, views)
+        places = frequency_code(self.tensor(rays.pixels), _PIXEL_FREQUENCIES)
+        groups = make_groups(np.arange(len(views) + 1), self.device)
+        return mlp(places, codes, groups, self.network.layers("mask"), "sigmoid")
+
+
+class NerfT(Nerf):
+    """NeRF whose colours know the time."""
+
+    name = "nerf-t"
+
+
+class NerfW(Nerf):
+    """NeRF-W: light of each photo, transient things with uncertainty.
+
+    Source: Martin-Brualla et al. 2021, "NeRF in the Wild".
+    """
+
+    name = "nerf-w"
+
+
+class NeuSC(Nerf):
+    """NeuSC: content in steps of the time, light of each photo, masks of transient things.
+
+    Source: Lin et al. 2023, "Neural Scene Chronology".
+    """
+
+    name = "neusc"
+    network_class = ContentNetwork
+
+
+def _codes(count: int, size: int, generator: torch.Generator) -> Tensor:
+    return 0.1 * torch.randn(count, size, generator=generator)

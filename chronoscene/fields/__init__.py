@@ -1,0 +1,13 @@
+"""Radiance fields: density and colour at places along rays, and the training of methods on them.
+
+What comes in is a `TrainingSet`; a subclass of `method.FieldMethod` says what the field is made of.
+
+- `box`: the part of space that the sparse points span, and the contraction of the rest.
+- `occupancy`, `marching`: where rays are sampled, for each period.
+- `grid`, `frequencies`: codes of a place; `mlp`: small networks; `compositing`: sums along rays.
+- `rays`: pixels of all photos, and their rays. `network`: a field of these; `method`: training.
+
+`grid`, `mlp` and `compositing` have a definition in plain torch each, which a GPU runs, and kernels
+for float32 on a CPU in ``*_kernels``. Values and gradients of the kernels have equal bits for any
+number of threads.
+"""

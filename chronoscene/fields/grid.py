@@ -1,0 +1,133 @@
+"""Multiresolution hash grid: a code of a place, interpolated from learned features.
+
+Source: Müller et al. 2022, "Instant Neural Graphics Primitives with a Multiresolution Hash
+Encoding", section 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from chronoscene.checks import check_shape
+from chronoscene.fields.grid_kernels import encode_backward, encode_forward
+from chronoscene.training import devices
+
+FEATURES = 2
+"""Features of a row of the table."""
+_PRIMES = (1, 2654435761, 805459861)
+_START = 1e-4  # Features start uniform within plus and minus this
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """Levels of a grid over the unit cube, whose cells become smaller by a constant factor."""
+
+    levels: int
+    """L"""
+    log2_rows: int
+    """Logarithm of the largest number of rows of a level; those that need no more are dense."""
+    base: int
+    """Cells along an edge on the first level."""
+    finest: int
+    """Cells along an edge on the last level."""
+
+    @property
+    def width(self) -> int:
+        """Numbers of a code."""
+        return FEATURES * self.levels
+
+    @cached_property
+    def resolutions(self) -> NDArray[np.int64]:
+        """Cells along an edge. [L]"""
+        growth = (self.finest / self.base) ** (1 / max(self.levels - 1, 1))
+        return np.floor(self.base * growth ** np.arange(self.levels) + 1e-6).astype(np.int64)
+
+    @cached_property
+    def dense(self) -> NDArray[np.bool_]:
+        """Levels on which each grid point has a row of its own. [L]"""
+        return (self.resolutions + 1) ** 3 <= 1 << self.log2_rows
+
+    @cached_property
+    def starts(self) -> NDArray[np.int64]:
+        """First row of each level, and the number of all rows. [L + 1]"""
+        sizes = np.minimum((self.resolutions + 1) ** 3, 1 << self.log2_rows)
+        return np.concatenate(([0], np.cumsum(sizes)))
+
+    def initial_table(self, generator: torch.Generator) -> Tensor:
+        """Draw the features that a training starts with. [E, 2]"""
+        shape = (int(self.starts[-1]), FEATURES)
+        return (2 * torch.rand(shape, generator=generator) - 1) * _START
+
+
+def encode_reference(places: Tensor, table: Tensor, layout: GridLayout) -> Tensor:
+    """Interpolate the code of each place in plain torch: the definition of `encode`.
+
+    On a level with R cells along an edge, a place x lies in the cell floor(R x); the features of
+    its eight corners are mixed trilinearly. Corner (i, j, k) has the row
+    i + (R + 1) (j + (R + 1) k) on a dense level, else (i xor 2654435761 j xor 805459861 k) mod the
+    rows of the level.
+    """
+    parts = []
+    for level, cells in enumerate(layout.resolutions.tolist()):
+        start, end = layout.starts[level : level + 2].tolist()
+        scaled = places * cells
+        lower = scaled.detach().floor()
+        share = scaled - lower
+        total = torch.zeros(len(places), FEATURES, dtype=table.dtype, device=table.device)
+        for corner in range(8):
+            bits = torch.tensor([corner >> axis & 1 for axis in range(3)], device=places.device)
+            weight = torch.where(bits.bool(), share, 1 - share).prod(dim=1, keepdim=True)
+            x, y, z = (lower.long() + bits).unbind(1)
+            if layout.dense[level]:
+                row = x + (cells + 1) * (y + (cells + 1) * z)
+            else:
+                row = (x ^ y * _PRIMES[1] ^ z * _PRIMES[2]) % (end - start)
+            total = total + weight * table.index_select(0, start + row)
+        parts.append(total)
+    return torch.cat(parts, dim=1)
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, places: Tensor, layout: GridLayout) -> Tensor:
+        out = torch.empty(len(places), layout.width)
+        levels = layout.resolutions, layout.starts, layout.dense
+        flat = table.detach().contiguous().view(-1).numpy()
+        encode_forward(places.numpy(), flat, *levels, out.view(-1).numpy())
+        ctx.places, ctx.levels = places, levels
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        rows = int(ctx.levels[1][-1])
+        out = torch.zeros(rows, FEATURES)
+        tasks = numba.get_num_threads()
+        given = grads[0].contiguous().numpy()
+        encode_backward(ctx.places.numpy(), given, *ctx.levels, tasks, out.numpy())
+        return out, None, None
+
+
+def encode(places: Tensor, table: Tensor, layout: GridLayout) -> Tensor:
+    """Interpolate the code of each place: `encode_reference`, compiled for float32 on a CPU.
+
+    Args:
+        places: In the unit cube, below 1; get no gradient. [N, 3]
+        table: Features of all levels. [E, 2]
+        layout: Levels.
+
+    Returns:
+        Codes, level by level. [N, 2 L]
+    """
+    check_shape("places", places, (None, 3))
+    check_shape("table", table, (int(layout.starts[-1]), FEATURES))
+    if devices.has_kernels(places, table):
+        return _Encode.apply(table, places.contiguous(), layout)
+    return encode_reference(places, table, layout)

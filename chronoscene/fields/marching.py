@@ -1,0 +1,161 @@
+"""Samples along rays: where the occupancy grid has something, and a few outside of the box."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy import float32
+from numpy.typing import NDArray
+
+from chronoscene.fields.box import SceneBox, contract
+from chronoscene.kernels.compilation import inner, kernel
+
+NEAR = 0.01
+"""Distance from the camera at which the first sample may be, in half edges of the cube."""
+_BLOCK = 64  # Rays per task
+_FAR = float32(1e9)
+_TINY = float32(1e-9)
+_LAST = float32(0.99999)  # Largest coordinate in the unit cube
+ZERO, ONE, TWO = float32(0), float32(1), float32(2)
+
+
+class Samples(NamedTuple):
+    """Samples of some rays, near ones first."""
+
+    places: NDArray[np.float32]
+    """In the unit cube, contracted. [N, 3]"""
+    lengths: NDArray[np.float32]
+    """Lengths that they stand for, in half edges of the cube; contracted outside. [N]"""
+    distances: NDArray[np.float32]
+    """From the camera, in half edges of the cube. [N]"""
+    starts: NDArray[np.int64]
+    """First sample of each ray, and the number of all. [R + 1]"""
+
+
+def march(
+    origins: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    periods: NDArray[np.int64],
+    jitter: NDArray[np.float32],
+    grids: tuple[NDArray[np.uint8], ...],
+    box: SceneBox,
+    step: float,
+    shells: int,
+) -> Samples:
+    """Place samples on rays.
+
+    In the box they are ``step`` apart and lie in occupied cells. Behind it come ``shells`` others,
+    at distances 1 s / (1 - s) for evenly spaced s, in occupied cells of the outer grid.
+
+    Args:
+        origins: Camera centres in the coordinates of the cube. [R, 3]
+        directions: Unit vectors. [R, 3]
+        periods: Period of each ray. [R]
+        jitter: Share of a step by which the samples of a ray are moved, 0..1. [R]
+        grids: Occupied cells of the cube, and of the contracted unit cube. [T, G, G, G] each
+        box: The box.
+        step: In half edges of the cube.
+        shells: Samples of a ray outside of the box, at most.
+    """
+    sides = np.array(box.sides, np.float32)
+    rays = len(origins)
+    starts = np.zeros(rays + 1, np.int64)
+    nothing = np.empty((0, 3), np.float32), np.empty(0, np.float32), np.empty(0, np.float32)
+    fixed = (origins, directions, periods, jitter, *grids, sides, float32(step), shells, starts)
+    _march(*fixed, False, *nothing)
+    np.cumsum(starts, out=starts)
+    count = int(starts[-1])
+    places = np.empty((count, 3), np.float32)
+    lengths, distances = np.empty(count, np.float32), np.empty(count, np.float32)
+    _march(*fixed, True, places, lengths, distances)
+    return Samples(places, lengths, distances, starts)
+
+
+@inner(fast_math=True)
+def _enter(ox, oy, oz, dx, dy, dz, sides):  # type: ignore[no-untyped-def]
+    """Distances at which a ray enters and leaves the box; none if the first is larger."""
+    near, far = float32(NEAR), _FAR
+    for o, d, side in ((ox, dx, sides[0]), (oy, dy, sides[1]), (oz, dz, sides[2])):
+        over = ONE / (d if abs(d) > _TINY else _TINY)
+        a, b = (-side - o) * over, (side - o) * over
+        near, far = max(near, min(a, b)), min(far, max(a, b))
+    return near, far
+
+
+@inner(fast_math=True)
+def _leave_cell(x, d, cell):  # type: ignore[no-untyped-def]
+    """Distance to the end of a cell along one axis; x in cells from the corner of the cube."""
+    if abs(d) < _TINY:
+        return _FAR
+    edge = math.floor(x) + (ONE if d > ZERO else ZERO)
+    return abs((edge - x) / d) * cell
+
+
+@inner(fast_math=True)
+def _outer_place(ox, oy, oz, dx, dy, dz, start, share):  # type: ignore[no-untyped-def]
+    """Contracted place and distance of the share of the way from the box to infinity."""
+    distance = start + share / (ONE - share)
+    x, y, z = contract(ox + distance * dx, oy + distance * dy, oz + distance * dz)
+    return x, y, z, distance
+
+
+@kernel(fast_math=True, parallel=True)
+def _march(  # type: ignore[no-untyped-def]
+    origins, directions, periods, jitter, inside, outside, sides, step, shells, starts, fill,
+    places, lengths, distances,
+):  # fmt: skip
+    """Count the samples of each ray into ``starts[1:]``, or write them from ``starts`` on."""
+    rays, cells, outer_cells = len(origins), inside.shape[1], outside.shape[1]
+    half = float32(cells) / TWO
+    cell = ONE / half
+    for block in prange((rays + _BLOCK - 1) // _BLOCK):
+        for ray in range(block * _BLOCK, min(rays, (block + 1) * _BLOCK)):
+            ox, oy, oz = origins[ray]
+            dx, dy, dz = directions[ray]
+            period, at = periods[ray], starts[ray] if fill else 0
+            near, far = _enter(ox, oy, oz, dx, dy, dz, sides)
+            t = near + jitter[ray] * step
+            while t < far:
+                x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+                gx, gy, gz = (x + ONE) * half, (y + ONE) * half, (z + ONE) * half
+                i = min(max(int(gx), 0), cells - 1)
+                j = min(max(int(gy), 0), cells - 1)
+                k = min(max(int(gz), 0), cells - 1)
+                if inside[period, i, j, k]:
+                    if fill:
+                        px, py, pz = contract(x, y, z)
+                        places[at, 0], places[at, 1], places[at, 2] = px, py, pz
+                        lengths[at], distances[at] = step, t
+                    at += 1
+                    t += step
+                    continue
+                out = min(
+                    _leave_cell(gx, dx, cell),
+                    min(_leave_cell(gy, dy, cell), _leave_cell(gz, dz, cell)),
+                )
+                t += max(ONE, float32(math.ceil(out / step))) * step
+            start = far if far > near else float32(NEAR)
+            for shell in range(shells):
+                share = (float32(shell) + jitter[ray]) / float32(shells)
+                x, y, z, t = _outer_place(ox, oy, oz, dx, dy, dz, start, min(share, _LAST))
+                i, j, k = int(x * outer_cells), int(y * outer_cells), int(z * outer_cells)
+                i, j, k = min(i, outer_cells - 1), min(j, outer_cells - 1), min(k, outer_cells - 1)
+                if not outside[period, i, j, k]:
+                    continue
+                if fill:
+                    share = float32(shell) / float32(shells)
+                    ax, ay, az, _ = _outer_place(ox, oy, oz, dx, dy, dz, start, share)
+                    share = min(float32(shell + 1) / float32(shells), _LAST)
+                    bx, by, bz, _ = _outer_place(ox, oy, oz, dx, dy, dz, start, share)
+                    bx, by, bz = bx - ax, by - ay, bz - az
+                    places[at, 0], places[at, 1] = min(x, _LAST), min(y, _LAST)
+                    places[at, 2] = min(z, _LAST)
+                    # The contracted cube of edge 4 became the unit cube.
+                    lengths[at] = float32(4) * math.sqrt(bx * bx + by * by + bz * bz)
+                    distances[at] = t
+                at += 1
+            if not fill:
+                starts[ray + 1] = at

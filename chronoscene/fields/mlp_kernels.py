@@ -1,0 +1,267 @@
+"""Kernels of small networks: blocks of rows through all layers.
+
+Rows are in groups, a ray with its samples each. Input that all rows of a group share goes through
+its part of the first layer once. A chunk is some groups that follow each other; it has gradients of
+the weights of its own, which are summed in the order of the chunks.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy import empty, float32
+from numpy.typing import NDArray
+
+from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.kernels.matmul import product, relu_product
+from chronoscene.kernels.memory import load, load_first, read, set_zero, store, store_first
+from chronoscene.kernels.vector_math import sigmoid
+from chronoscene.kernels.vectors import LANES, select, splat
+
+BLOCK = 64  # Rows that go through all layers together
+SLICE = 1024  # Gradients of weights summed over the chunks by one task
+ZERO = float32(0)
+ONE = float32(1)
+
+
+class Layers(NamedTuple):
+    """Sizes of a network, and where its weights lie in one flat array; int64 arrays.
+
+    Layer l has a matrix of `widths` [l, l + 1] at `matrix`, its transpose at `transposed`, and a
+    bias. The shared part of the first layer is the last of the matrices.
+    """
+
+    widths: NDArray[np.int64]
+    """Padded widths: of the input, of each hidden layer, of the output. [K + 1]"""
+    matrix: NDArray[np.int64]
+    """[K + 1]"""
+    transposed: NDArray[np.int64]
+    """[K + 1]"""
+    bias: NDArray[np.int64]
+    """[K]"""
+    hidden: NDArray[np.int64]
+    """Place of each hidden layer in a row of the activations. [K]"""
+    inputs: int
+    outputs: int
+    shared: int
+    """Numbers that a group shares."""
+    shared_pad: int
+    row: int
+    """Numbers in a row of the activations."""
+    size: int
+    """Numbers of all weights without the transposes: they come last."""
+    sigmoid: bool
+    """True if the output goes through the logistic function."""
+
+
+@inner
+def _copy_rows(source, row, width, target, padded, count):  # type: ignore[no-untyped-def]
+    """Copy rows into a block and fill it up with zeros."""
+    for i in range(count):
+        for c in range(0, padded, LANES):
+            store(target, i * padded + c, load_first(source, (row + i) * width + c, width - c))
+    set_zero(target, count * padded, BLOCK * padded)
+
+
+@inner
+def _shared_part(layers, weights, shared, first, last, work, out):  # type: ignore[no-untyped-def]
+    """Send what groups share through the first layer, with its bias. [groups, H]"""
+    hidden, pad = layers.widths[1], layers.shared_pad
+    zero = (weights, layers.bias[0], 0)
+    for group in range(first, last, BLOCK):
+        count = min(BLOCK, last - group)
+        _copy_rows(shared, group, layers.shared, work, pad, count)
+        right = (weights, layers.matrix[-1], hidden)
+        into = (out, (group - first) * hidden, hidden)
+        product((work, 0, pad, 1), right, zero, into, BLOCK, hidden, layers.shared)
+
+
+@kernel(parallel=True)
+def mlp_forward(layers, weights, x, shared, starts, groups, chunks, acts, out):  # type: ignore[no-untyped-def]
+    """Compute the outputs of all rows, and keep the hidden layers.
+
+    Args:
+        layers: `Layers`.
+        weights: Flat.
+        x: Flat [N, I].
+        shared: Flat [R, J].
+        starts: First row of each group, and the end. int64 [R + 1]
+        groups: Group of each row. int32 [N]
+        chunks: First group of each chunk, and the end. int64 [C + 1]
+        acts: Flat [N, row], written if not empty.
+        out: Flat [N, O], written.
+    """
+    depth = len(layers.widths) - 1
+    keep = acts.shape[0] > 0
+    for chunk in prange(len(chunks) - 1):
+        first, last = chunks[chunk], chunks[chunk + 1]
+        hidden = layers.widths[1]
+        common = empty((last - first + BLOCK) * hidden, float32)
+        work = empty(BLOCK * max(layers.shared_pad, layers.widths.max()), float32)
+        other = empty(BLOCK * layers.widths.max(), float32)
+        _shared_part(layers, weights, shared, first, last, work, common)
+        for row in range(starts[first], starts[last], BLOCK):
+            count = min(BLOCK, starts[last] - row)
+            left, right = work, other
+            _copy_rows(x, row, layers.inputs, left, layers.widths[0], count)
+            for layer in range(depth):
+                inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
+                matrix = (weights, layers.matrix[layer], outputs)
+                a, into = (left, 0, inputs, 1), (right, 0, outputs)
+                if layer == 0:
+                    for i in range(BLOCK):
+                        place = (groups[row + min(i, count - 1)] - first) * hidden
+                        for c in range(0, hidden, LANES):
+                            store(right, i * hidden + c, load(common, place + c))
+                    if depth == 1:
+                        product(a, matrix, into, into, BLOCK, outputs, inputs)
+                    else:
+                        relu_product(a, matrix, into, into, BLOCK, outputs, inputs)
+                elif layer == depth - 1:
+                    bias = (weights, layers.bias[layer], 0)
+                    product(a, matrix, bias, into, BLOCK, outputs, inputs)
+                else:
+                    bias = (weights, layers.bias[layer], 0)
+                    relu_product(a, matrix, bias, into, BLOCK, outputs, inputs)
+                if keep and layer < depth - 1:
+                    for i in range(count):
+                        at = (row + i) * layers.row + layers.hidden[layer]
+                        for c in range(0, outputs, LANES):
+                            store(acts, at + c, load(right, i * outputs + c))
+                left, right = right, left
+            width = layers.widths[depth]
+            for i in range(count):
+                for c in range(0, width, LANES):
+                    value = load(left, i * width + c)
+                    if layers.sigmoid:
+                        value = sigmoid(value)
+                    store_first(out, (row + i) * layers.outputs + c, value, layers.outputs - c)
+
+
+@inner
+def _column_sums(rows, width, total, at):  # type: ignore[no-untyped-def]
+    for c in range(0, width, LANES):
+        value = load(total, at + c)
+        for i in range(BLOCK):
+            value = value + load(rows, i * width + c)
+        store(total, at + c, value)
+
+
+@inner
+def _output_gradient(layers, out, grads, row, count, target):  # type: ignore[no-untyped-def]
+    """Gradient before the last activation; True if any number is not zero."""
+    width = layers.widths[-1]
+    _copy_rows(grads, row, layers.outputs, target, width, count)
+    found = ZERO
+    for i in range(count * width):
+        found += abs(read(target, i))
+    if layers.sigmoid:
+        for i in range(count):
+            for c in range(0, width, LANES):
+                at, left = (row + i) * layers.outputs + c, layers.outputs - c
+                value = load_first(out, at, left)
+                grad = load(target, i * width + c)
+                store(target, i * width + c, grad * value * (ONE - value))
+    return found != ZERO
+
+
+@inner
+def _shared_gradient(layers, weights, shared, first, last, work, common, part, d_shared):  # type: ignore[no-untyped-def]
+    """Gradients of what groups share, of its part of the first layer, and of the bias."""
+    hidden, pad = layers.widths[1], layers.shared_pad
+    other = empty(BLOCK * pad, float32)
+    for group in range(first, last, BLOCK):
+        count = min(BLOCK, last - group)
+        at = (group - first) * hidden
+        for i in range(count, BLOCK):
+            set_zero(common, at + i * hidden, at + (i + 1) * hidden)
+        for c in range(0, hidden, LANES):
+            total = load(part, layers.bias[0] + c)
+            for i in range(BLOCK):
+                total = total + load(common, at + i * hidden + c)
+            store(part, layers.bias[0] + c, total)
+        if pad == 0:
+            continue
+        _copy_rows(shared, group, layers.shared, work, pad, count)
+        into = (part, layers.matrix[-1], hidden)
+        product((work, 0, 1, pad), (common, at, hidden), into, into, pad, hidden, BLOCK)
+        back = (weights, layers.transposed[-1], pad)
+        set_zero(other, 0, BLOCK * pad)
+        rows = (other, 0, pad)
+        product((common, at, hidden, 1), back, rows, rows, BLOCK, pad, hidden)
+        for i in range(count):
+            for c in range(0, pad, LANES):
+                place = (group + i) * layers.shared + c
+                store_first(d_shared, place, load(other, i * pad + c), layers.shared - c)
+
+
+@kernel(parallel=True)
+def mlp_backward(  # type: ignore[no-untyped-def]
+    layers, weights, x, shared, starts, groups, chunks, acts, out, grads, partial, d_x, d_shared
+):
+    """Write gradients of what `mlp_forward` reads; arguments as there, and these.
+
+    Args:
+        grads: Of ``out``. Flat [N, O]
+        partial: Gradients of the weights, zeros; the first row receives the sum. [C, size]
+        d_x: Flat [N, I], zeros.
+        d_shared: Flat [R, J], written.
+    """
+    depth = len(layers.widths) - 1
+    widest = layers.widths.max()
+    for chunk in prange(len(chunks) - 1):
+        first, last, part = chunks[chunk], chunks[chunk + 1], partial[chunk]
+        hidden = layers.widths[1]
+        common = empty((last - first + BLOCK) * hidden, float32)
+        set_zero(common, 0, (last - first) * hidden)
+        work = empty(BLOCK * max(layers.shared_pad, widest), float32)
+        current, other = empty(BLOCK * widest, float32), empty(BLOCK * widest, float32)
+        for row in range(starts[first], starts[last], BLOCK):
+            count = min(BLOCK, starts[last] - row)
+            d, before = current, other
+            if not _output_gradient(layers, out, grads, row, count, d):
+                continue
+            for layer in range(depth - 1, -1, -1):
+                inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
+                if layer == 0:
+                    _copy_rows(x, row, layers.inputs, work, inputs, count)
+                else:
+                    for i in range(count):
+                        at = (row + i) * layers.row + layers.hidden[layer - 1]
+                        for c in range(0, inputs, LANES):
+                            store(work, i * inputs + c, load(acts, at + c))
+                    set_zero(work, count * inputs, BLOCK * inputs)
+                into = (part, layers.matrix[layer], outputs)
+                product((work, 0, 1, inputs), (d, 0, outputs), into, into, inputs, outputs, BLOCK)
+                if layer:
+                    _column_sums(d, outputs, part, layers.bias[layer])
+                else:
+                    for i in range(count):
+                        place = (groups[row + i] - first) * hidden
+                        for c in range(0, hidden, LANES):
+                            total = load(common, place + c) + load(d, i * hidden + c)
+                            store(common, place + c, total)
+                set_zero(before, 0, BLOCK * inputs)
+                back, rows = (weights, layers.transposed[layer], inputs), (before, 0, inputs)
+                product((d, 0, outputs, 1), back, rows, rows, BLOCK, inputs, outputs)
+                if layer:
+                    zero = splat(ZERO)
+                    for i in range(0, BLOCK * inputs, LANES):
+                        value = select(zero < load(work, i), load(before, i), zero)
+                        store(before, i, value)
+                d, before = before, d
+            width = layers.widths[0]
+            for i in range(count):
+                for c in range(0, width, LANES):
+                    left = layers.inputs - c
+                    store_first(d_x, (row + i) * layers.inputs + c, load(d, i * width + c), left)
+        _shared_gradient(layers, weights, shared, first, last, work, common, part, d_shared)
+    size = partial.shape[1]
+    for piece in prange((size + SLICE - 1) // SLICE):
+        for i in range(piece * SLICE, min((piece + 1) * SLICE, size)):
+            total = partial[0, i]
+            for chunk in range(1, len(chunks) - 1):
+                total += partial[chunk, i]
+            partial[0, i] = total

@@ -1,0 +1,169 @@
+"""Kernels of radiance fields against their definitions, in values and gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from chronoscene.fields.compositing import STOP, composite, composite_reference, truncated_exp
+from chronoscene.fields.grid import GridLayout, encode, encode_reference
+from chronoscene.fields.mlp import Groups, initial_layers, make_groups, mlp, mlp_reference
+from chronoscene.kernels.runtime import set_threads
+
+LAYOUT = GridLayout(levels=4, log2_rows=10, base=4, finest=40)
+
+
+def gradients(function: Callable[..., Tensor], tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Value and gradients of a weighted sum of the output."""
+    leaves = [t.detach().clone().requires_grad_() for t in tensors]
+    out = function(*leaves)
+    weights = torch.linspace(0.1, 1, out.numel(), dtype=out.dtype).view(out.shape)
+    (out * weights).sum().backward()
+    return [out.detach(), *(leaf.grad for leaf in leaves)]  # type: ignore[misc]
+
+
+def assert_like_reference(
+    fast: Callable[..., Tensor], reference: Callable[..., Tensor], tensors: Sequence[Tensor]
+) -> None:
+    """Compare with the definition in float64; one and two threads give equal bits."""
+    expected = gradients(reference, [t.double() for t in tensors])
+    found = []
+    for threads in (1, 2):
+        set_threads(threads)
+        found.append(gradients(fast, tensors))
+    for one, two, exact in zip(*found, expected, strict=True):
+        assert torch.equal(one, two)
+        # Measured: 3e-6 of the largest number at most.
+        torch.testing.assert_close(
+            one.double(), exact, rtol=0, atol=2e-5 * float(exact.abs().max())
+        )
+
+
+def some_groups(counts: Sequence[int]) -> Groups:
+    return make_groups(np.concatenate(([0], np.cumsum(counts))).astype(np.int64))
+
+
+def test_grid() -> None:
+    places = torch.rand(3_000, 3, generator=torch.Generator().manual_seed(0))
+    table = torch.randn(int(LAYOUT.starts[-1]), 2, generator=torch.Generator().manual_seed(1))
+    assert LAYOUT.dense.tolist() == [True, True, False, False]
+    assert_like_reference(
+        lambda t: encode(places, t, LAYOUT),
+        lambda t: encode_reference(places.double(), t, LAYOUT),
+        [table],
+    )
+
+
+def test_grid_of_ones_is_one() -> None:
+    places = torch.rand(50, 3)
+    table = torch.ones(int(LAYOUT.starts[-1]), 2)
+    torch.testing.assert_close(encode(places, table, LAYOUT), torch.ones(50, LAYOUT.width))
+
+
+@pytest.mark.parametrize(
+    ("widths", "output"),
+    [((10, 24, 9, 5), "none"), ((10, 64, 64, 3), "sigmoid"), ((10, 4), "none")],
+)
+def test_mlp(widths: tuple[int, ...], output: str) -> None:
+    generator = torch.Generator().manual_seed(2)
+    counts = np.random.default_rng(3).integers(0, 40, 150)
+    groups = some_groups(counts.tolist())
+    layers = initial_layers(widths, generator)
+    layers = [t + 0.1 * torch.randn(t.shape, generator=generator) for t in layers]
+    x = torch.randn(int(counts.sum()), 7, generator=generator)
+    shared = torch.randn(150, 3, generator=generator)
+    assert_like_reference(
+        lambda x, s, *layers: mlp(x, s, groups, layers, output),  # type: ignore[arg-type]
+        lambda x, s, *layers: mlp_reference(x, s, groups, layers, output),  # type: ignore[arg-type]
+        [x, shared, *layers],
+    )
+
+
+def test_mlp_without_shared_input() -> None:
+    generator = torch.Generator().manual_seed(2)
+    groups = some_groups([70, 3])
+    layers = initial_layers((5, 8, 2), generator)
+    x = torch.randn(73, 5, generator=generator)
+    assert_like_reference(
+        lambda x, *layers: mlp(x, torch.zeros(2, 0), groups, layers),
+        lambda x, *layers: mlp_reference(x, torch.zeros(2, 0).double(), groups, layers),
+        [x, *layers],
+    )
+
+
+def test_composite() -> None:
+    generator = torch.Generator().manual_seed(4)
+    groups = some_groups([0, 5, 30, 1, 0, 64] * 20)
+    count = int(groups.starts[-1])
+    densities = torch.rand(count, generator=generator) * 3
+    densities[40:60] = 400  # so that rays end
+    lengths = torch.rand(count, generator=generator) * 0.1
+    values = torch.rand(count, 4, generator=generator)
+
+    def both(function: Callable[..., tuple[Tensor, Tensor]]) -> Callable[..., Tensor]:
+        def joined(d: Tensor, v: Tensor) -> Tensor:
+            sums, opacities = function(d, v, lengths.to(d), groups)
+            return torch.cat((sums, opacities[:, None]), dim=1)
+
+        return joined
+
+    assert_like_reference(both(composite), both(composite_reference), [densities, values])
+
+
+def test_gradients_of_the_definitions() -> None:
+    torch.manual_seed(0)
+    groups = some_groups([3, 0, 4])
+    lengths = torch.rand(7).double()
+    layers = [t.double().requires_grad_() for t in initial_layers((5, 6, 2), torch.Generator())]
+    inputs = (torch.rand(7).double() + 0.1, torch.rand(7, 2).double())
+    leaves = [t.requires_grad_() for t in inputs]
+    assert torch.autograd.gradcheck(lambda d, v: composite_reference(d, v, lengths, groups), leaves)
+    x, shared = torch.randn(7, 3).double(), torch.randn(3, 2).double()
+    leaves = [x.requires_grad_(), shared.requires_grad_(), *layers]
+    assert torch.autograd.gradcheck(
+        lambda x, s, *layers: mlp_reference(x, s, groups, layers, "sigmoid"), leaves
+    )
+    table = torch.randn(int(LAYOUT.starts[-1]), 2).double()[:, :].requires_grad_()
+    places = torch.rand(3, 3).double()
+    (encode_reference(places, table, LAYOUT)[:, 5]).sum().backward()
+    step = torch.zeros_like(table)
+    row = int(table.grad[:, 1].abs().argmax())  # type: ignore[index]
+    step[row, 1] = 1e-6
+    change = encode_reference(places, table + step, LAYOUT) - encode_reference(
+        places, table, LAYOUT
+    )
+    assert float(change.detach()[:, 5].sum()) / 1e-6 == pytest.approx(
+        float(table.grad[row, 1]), rel=1e-6
+    )  # type: ignore[index]
+
+
+def test_slab_of_constant_density() -> None:
+    """A slab of density s and thickness d lets exp(-s d) through, into however many samples."""
+    groups = some_groups([16])
+    lengths = torch.full((16,), 0.05)
+    _, opacity = composite(torch.full((16,), 2.0), torch.ones(16, 1), lengths, groups)
+    assert float(opacity) == pytest.approx(1 - np.exp(-1.6), abs=1e-6)
+
+
+def test_nothing_counts_behind_an_opaque_sample() -> None:
+    groups = some_groups([2])
+    densities = torch.tensor([-np.log(STOP) * 1.01, 5.0])
+    values = torch.tensor([[1.0], [7.0]], requires_grad=True)
+    sums, _ = composite(densities.float(), values, torch.ones(2), groups)
+    sums.sum().backward()  # type: ignore[no-untyped-call]
+    assert values.grad is not None
+    assert values.grad[1] == 0
+
+
+def test_density_of_a_large_output_is_finite() -> None:
+    x = torch.tensor([-200.0, 0.0, 1e4], requires_grad=True)
+    density = truncated_exp(x)
+    density.sum().backward()  # type: ignore[no-untyped-call]
+    assert density.isfinite().all()
+    assert density[1] == 1
+    assert x.grad is not None
+    assert x.grad.isfinite().all()
