@@ -107,8 +107,8 @@ SOURCES["usable_cameras"] = "cameras"
 """Attributes that are empty, not None, without the part that they are read from."""
 
 RETIRED = (
-    *("CS109", "CS113", "CS114", "CS137", "CS142", "CS214", "CS216", "CS226", "CS231", "CS244"),
-    *("CS326", "CS511", "CS517", "CS519", "CS521", "CS524", "CS707"),
+    *("CS109", "CS113", "CS114", "CS142", "CS214", "CS216", "CS226", "CS244", "CS326"),
+    *("CS511", "CS517", "CS519", "CS521", "CS524", "CS707"),
 )
 """Codes of rules that are gone; they are never reused."""
 

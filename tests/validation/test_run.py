@@ -26,7 +26,7 @@ def test_good_scene(scene):
     assert report.summary.images == 18
     assert report.summary.points == 40
     assert report.summary.observations == 720
-    assert [s.code for s in report.skipped] == ["CS206", "CS604"]
+    assert [s.code for s in report.skipped] == ["CS206", "CS231", "CS604"]
 
 
 def test_all_problems_are_collected(scene):

@@ -28,6 +28,7 @@ Track = Callable[[Sequence[T], str], Iterable[T]]
 """Passes items on and shows the progress under a description."""
 
 THUMBNAIL = 32  # Pixels along each side of a thumbnail
+GREY_SIDE = 160  # Pixels along the longer side of a small grey image: 20 kB for each image
 
 END_MARKS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND"}
 """End markers of files. Compressed JPEG data cannot contain its own."""
@@ -80,6 +81,8 @@ class Pixels:
     """SHA-256 of size and RGB bytes."""
     thumbnail: NDArray[np.float32] | None = None
     """Mean colours, 0..255. [32, 32, 3]"""
+    grey: NDArray[np.uint8] | None = None
+    """Mean brightness, at most `GREY_SIDE` pixels along its longer side. [h, w]"""
 
 
 def read_headers(folder: Path, names: Sequence[str]) -> dict[str, Header]:
@@ -246,7 +249,11 @@ def read_pixels_of(path: Path) -> Pixels:
         return Pixels(damage)
     digest = hashlib.sha256(repr(rgb.shape).encode() + rgb.tobytes()).digest()
     small = Image.fromarray(rgb).resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
-    return Pixels(None, digest, np.asarray(small, np.float32))
+    grey = Image.fromarray(rgb).convert("L")
+    scale = min(1.0, GREY_SIDE / max(grey.size))
+    size = max(1, round(grey.width * scale)), max(1, round(grey.height * scale))
+    grey = grey.resize(size, Image.Resampling.BOX)
+    return Pixels(None, digest, np.asarray(small, np.float32), np.asarray(grey))
 
 
 def _problem(error: Exception) -> str:

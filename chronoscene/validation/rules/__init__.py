@@ -15,6 +15,7 @@ from chronoscene.validation.rules import (  # noqa: F401  (importing them regist
     cs1_poses,
     cs2_image_files,
     cs2_metadata,
+    cs2_other_photo,
     cs3_split,
     cs4_periods,
     cs5_across_periods,

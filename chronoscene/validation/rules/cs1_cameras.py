@@ -135,6 +135,21 @@ def principal_point_outside(scene: RawScene, usable_cameras: dict[int, Camera]) 
             yield Hit(scene.camera_place(camera), expected, f"({cx:.5g}, {cy:.5g})")
 
 
+@rule.info(
+    "CS137",
+    bad="`cameras.bin` has cameras 1 and 2, but all images have camera 1",
+    remedy="nothing to do, unless images are missing from the model",
+)
+def camera_unused(scene: RawScene, cameras: Sequence[Camera], images: RawImages) -> Iterator[Hit]:
+    """A camera is not used by any image."""
+    used = set(images.camera_ids.tolist())
+    if not used or not used <= {camera.camera_id for camera in cameras}:
+        return  # cameras and images do not belong together, which has its own rule
+    for camera in cameras:
+        if camera.camera_id not in used:
+            yield Hit(scene.camera_place(camera), "images of this camera", "none")
+
+
 def _polynomial(scene: RawScene) -> list[Camera]:
     """Usable cameras of polynomial models."""
     return [c for c in scene.usable_cameras.values() if c.model in POLYNOMIAL_MODELS]

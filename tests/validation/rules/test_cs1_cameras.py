@@ -114,6 +114,11 @@ def test_principal_point_outside(scene):
     scene.expect("CS136", place=PLACE, found="(70, 24)", also=also)
 
 
+def test_camera_unused(scene):
+    scene.write(CAMERAS, [*scene.lines(CAMERAS), "2 PINHOLE 64 48 50 50 32 24"])
+    scene.expect("CS137", place=f"{CAMERAS} (camera 2)", found="none")
+
+
 @pytest.mark.parametrize(
     ("model", "params"),
     [
