@@ -75,7 +75,7 @@ def adjust_with_control(
         frame.set_cam_from_world(image.camera_id, image.cam_from_world())
         model.cameras[image.camera_id].params = work.cameras[image.camera_id].params
     for point_id, point3D in model.points3D.items():
-        point3D.xyz = np.array(work.points3D[point_id].xyz)
+        point3D.xyz = work.points3D[point_id].xyz.tolist()
     return ids
 
 
