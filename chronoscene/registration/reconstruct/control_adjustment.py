@@ -73,9 +73,9 @@ def adjust_with_control(
         image = work.images[image_id]
         frame = model.frames[model.images[image_id].frame_id]
         frame.set_cam_from_world(image.camera_id, image.cam_from_world())
-        model.cameras[image.camera_id].params = work.cameras[image.camera_id].params
+        model.cameras[image.camera_id].params = work.cameras[image.camera_id].params.tolist()
     for point_id, point3D in model.points3D.items():
-        point3D.xyz = work.points3D[point_id].xyz.tolist()
+        point3D.xyz = work.points3D[point_id].xyz
     return ids
 
 
