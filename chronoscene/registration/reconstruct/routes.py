@@ -15,17 +15,13 @@ import numpy as np
 from chronoscene.errors import RegistrationError
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.control.adjustment import add_point, adjust_with_control, drop_bad
 from chronoscene.registration.features.database import verified_matches
 from chronoscene.registration.reconstruct.consistency import (
     Matches,
     agreement,
     deregister_misplaced,
     pair_agreements,
-)
-from chronoscene.registration.reconstruct.control_adjustment import (
-    add_point,
-    adjust_with_control,
-    drop_bad,
 )
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
 from chronoscene.registration.reconstruct.mapping import (
@@ -216,7 +212,7 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (parameters by
     name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``control`` (see
-    `control_adjustment.adjust_with_control`), ``out``, ``scratch``, ``threads``.
+    `adjustment.adjust_with_control`), ``out``, ``scratch``, ``threads``.
     """
     task = Task.start(arguments, report)
     model = known_images(task.database)
