@@ -18,7 +18,7 @@ anew; a test compares it with the program.
 
 Exit status: 0 success; 1 the command found what it was asked to look for (a validator's error, a
 broken rule of a method), or part of its work failed, as it reports; 2 wrong usage, or input that
-cannot be read. `python -m chronoscene` is the same as `chronoscene`.
+cannot be read; 130 after Ctrl-C. `python -m chronoscene` is the same as `chronoscene`.
 """
 
 SUBJECTS = {

@@ -55,6 +55,8 @@ COMMANDS = {
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 """Settings of all commands."""
 
+INTERRUPTED = 130  # Exit status after Ctrl-C or SIGTERM, as in a shell
+
 USAGE_ERROR = 2  # Exit status for wrong usage and for input that cannot be read at all
 
 
@@ -87,7 +89,14 @@ def main() -> None:
     """
     try:
         with stoppable():
-            cli.main(prog_name="chronoscene")
+            status = cli.main(prog_name="chronoscene", standalone_mode=False)
+        sys.exit(status if isinstance(status, int) else 0)
+    except click.Abort:  # Ctrl-C: 1 would say that something failed
+        click.secho("interrupted; what was finished before is kept", err=True)
+        sys.exit(INTERRUPTED)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
     except ChronoSceneError as error:
         _end(str(error))
     except OSError as error:  # a full disk, a place that went away

@@ -39,14 +39,29 @@ _DATE = re.compile(
 )
 
 
+RTK_FIXED, RTK_FLOAT = 50, 34
+"""Values of ``RtkFlag``; 16 is a position without corrections, 0 is none."""
+
+
 @dataclass(frozen=True, slots=True)
 class DroneData:
-    """Data that DJI drones add in XMP."""
+    """Data that drones add in XMP."""
 
     relative_altitude: float | None = None
     """Metres above the take-off point, by barometer."""
     rtk_std: tuple[float, float, float] | None = None
     """Standard deviations of longitude, latitude and height in metres."""
+    rtk_flag: int | None = None
+    """`RTK_FIXED`, for example."""
+    calibrated_focal: float | None = None
+    """Focal length by calibration, in pixels of the photo as it was taken."""
+    heading: float | None = None
+    """Degrees clockwise from north, of a camera on a gimbal."""
+
+
+_DRONE = re.compile(rb"(?:drone(?:-\w+)?|Camera):\w")
+
+_UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # Millimetres in a unit of the focal plane's resolution
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +79,14 @@ class ExifData:
     focal_mm: float | None = None
     focal_35mm: float | None = None
     """Focal length on 36 x 24 mm film with the same view, in millimetres."""
+    focal_plane: float | None = None
+    """Pixels of the photo as it was taken, per millimetre of the sensor."""
+    gps_error: float | None = None
+    """Horizontal error of the position in metres."""
+    gps_dop: float | None = None
+    """Dilution of precision of the position."""
+    heading: float | None = None
+    """Degrees clockwise from true north in which the camera looks."""
     make: str | None = None
     model: str | None = None
     orientation: int = 1
@@ -138,6 +161,10 @@ def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
         altitude=altitude,
         focal_mm=_positive(_number(exif.get(Base.FocalLength))),
         focal_35mm=_positive(_number(exif.get(Base.FocalLengthIn35mmFilm))),
+        focal_plane=_focal_plane(exif),
+        gps_error=_positive(_number(gps.get(GPS.GPSHPositioningError))),
+        gps_dop=_positive(_number(gps.get(GPS.GPSDOP))),
+        heading=_heading(gps),
         make=_text(main.get(Base.Make)),
         model=_text(main.get(Base.Model)),
         orientation=orientation if 1 <= orientation <= 8 else 1,
@@ -147,21 +174,45 @@ def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
     )
 
 
+def _focal_plane(exif: Mapping[int, Any]) -> float | None:
+    """Resolution of the sensor, in pixels per millimetre."""
+    resolution = _positive(_number(exif.get(Base.FocalPlaneXResolution)))
+    unit = _UNITS.get(_integer(exif.get(Base.FocalPlaneResolutionUnit)) or 2)
+    return None if resolution is None or unit is None else resolution / unit
+
+
+def _heading(gps: Mapping[int, Any]) -> float | None:
+    """Direction of view; one from magnetic north is not comparable."""
+    degrees = _number(gps.get(GPS.GPSImgDirection))
+    magnetic = (_text(gps.get(GPS.GPSImgDirectionRef)) or "T").upper().startswith("M")
+    return None if degrees is None or magnetic or not 0 <= degrees <= 360 else degrees
+
+
 def _drone(xmp: Any) -> DroneData | None:
-    """Find DJI's attributes by name: untrusted XMP is not given to an XML parser."""
-    if not isinstance(xmp, bytes) or b"drone-dji:" not in xmp[:MAX_XMP_BYTES]:
+    """Find attributes of DJI, Autel and Pix4D by name: an XML parser gets no untrusted XMP."""
+    if not isinstance(xmp, bytes) or not _DRONE.search(xmp[:MAX_XMP_BYTES]):
         return None
     text = xmp[:MAX_XMP_BYTES].decode("utf-8", "replace")
 
     def value(name: str) -> float | None:
-        pattern = rf"drone-dji:{name}\s*(?:=\s*[\"']|>)\s*([-+0-9.eE]{{1,40}})"
+        pattern = rf"(?:drone(?:-\w+)?|Camera):{name}\s*(?:=\s*[\"']|>)\s*([-+0-9.eE]{{1,40}})"
         found = re.search(pattern, text)
         return _number(found[1]) if found else None
 
     lon, lat, height = (value(f"RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt"))
-    if lon is None or lat is None or height is None:
-        return DroneData(value("RelativeAltitude"))
-    return DroneData(value("RelativeAltitude"), (lon, lat, height))
+    if lon is None and lat is None and height is None:
+        lon = lat = value("GPSXYAccuracy")
+        height = value("GPSZAccuracy")
+    known = lon is not None and lat is not None and height is not None
+    dewarp = re.search(r"DewarpData\s*=\s*[\"'][^;\"']{1,20};([0-9.]{1,20}),", text)
+    focal = _number(dewarp[1]) if dewarp else None
+    return DroneData(
+        relative_altitude=value("RelativeAltitude"),
+        rtk_std=(lon, lat, height) if known else None,  # type: ignore[arg-type]
+        rtk_flag=_integer(value("RtkFlag")),
+        calibrated_focal=_positive(focal) or _positive(value("CalibratedFocalLength")),
+        heading=value("GimbalYawDegree"),
+    )
 
 
 def _date(value: Any) -> datetime | None:

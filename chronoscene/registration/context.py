@@ -39,8 +39,8 @@ class Options:
     """Share of the tracks across periods that take no part in the estimation."""
     cameras: Path | None = None
     """File of known calibrations; see `photos.known_cameras`."""
-    camera_model: str = "SIMPLE_RADIAL"
-    """COLMAP's camera model for the photos."""
+    camera_model: str = "auto"
+    """COLMAP's camera model for the photos; ``auto`` for one that their number determines."""
     calibration: Calibration = "auto"
     """Sharing of calibrations between periods that used the same camera."""
     threads: int | None = None

@@ -172,7 +172,7 @@ class Inspection:
     verdict: Verdict
     """On the alignment of the periods with each other."""
     position: Position
-    """On the absolute position."""
+    """On position and scale in the world."""
 
     @property
     def failed(self) -> bool:
@@ -187,6 +187,9 @@ class Inspection:
         lines += [f"  to do: {todo}" for todo in verdict.todo[:3]]
         lines.append(f"absolute position: {position.level}. {position.text}")
         lines += [f"  {name}: {rmse.text}" for name, rmse in position.lines]
+        if position.scale_error is not None:
+            lines.append(f"  scale: known to {position.scale_error:.2%} by GPS")
+        lines += [f"  {c.what}: {c.text}" for c in position.metadata]
         lines += [f"  to do: {todo}" for todo in position.todo[:3]]
         return "\n".join(lines) + "\n"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference
 from chronoscene.registration.features import METHOD
+from chronoscene.registration.photos.stated import Stated
 from chronoscene.scene import Camera
 
 Route = Literal["joint", "frozen", "separate", "resection"]
 
 ROUTES: tuple[Route, ...] = ("joint", "frozen", "separate", "resection")
+
+
+ANOTHER_PLACE = "another place, or wrong positions"
+"""End of the reason why photos of a period are missing that is far from the others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +119,12 @@ class Registered:
     held_out_tracks: HeldOutTracks
     images_root: str
     """Folder of the images: photos as ``cameras`` describe them."""
+    stated: Mapping[str, Stated] = field(default_factory=dict)
+    """Metadata of photos to compare with, by name."""
+    short: bool = False
+    """True if points of two images and of small angles count."""
+    held: bool = False
+    """True if focal lengths are those that photos state."""
     unplaced: frozenset[str] = frozenset()
     """Images of periods that are in a frame of their own, to be placed by tie points."""
     features: str = METHOD

@@ -138,7 +138,7 @@ def _register(project: Project) -> Sequence[Path]:
         captures = read_captures(folder, table=table)
         options = Registration(page=True, overwrite=True)
         register(captures, scene, options, report=report, inspected=judged.append)
-    for line in (*captures.misdated, *judged[0].summary.splitlines()):
+    for line in (*captures.notes, *judged[0].summary.splitlines()):
         project.say(line)
     return [scene / PAGE, scene / CERTIFICATE, scene / "sparse/0/images.bin"]
 

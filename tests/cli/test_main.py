@@ -125,3 +125,30 @@ def test_help_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_an_interruption_does_not_exit_like_a_failure(monkeypatch, capsys):
+    @click.command("stopped")
+    def stopped() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli_package.cli, "get_command", lambda ctx, name: stopped)
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "stopped"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert "interrupted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("status", "code"), [(0, 0), (1, 1)])
+def test_a_verdict_sets_the_exit_status(monkeypatch, status, code):
+    @click.command("judged")
+    @click.pass_context
+    def judged(context: click.Context) -> None:
+        context.exit(status)
+
+    monkeypatch.setattr(cli_package.cli, "get_command", lambda ctx, name: judged)
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "judged"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == code

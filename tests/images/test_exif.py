@@ -74,7 +74,27 @@ def test_tags_of_a_tiff():
 
 def test_drone():
     drone = read(photo(xmp=XMP)).drone
-    assert drone == DroneData(61.3, (0.0113, 0.0107, 0.0246))
+    std = (0.0113, 0.0107, 0.0246)
+    assert drone == DroneData(61.3, std, rtk_flag=50, heading=-93.1)
+
+
+def test_calibration_and_accuracy_by_other_makers():
+    pix4d = b'<d Camera:GPSXYAccuracy="0.015" Camera:GPSZAccuracy="0.03" '
+    dewarp = b'drone-dji:DewarpData="2018-10-19;3678.87,3671.84,10.1,27.2,-0.26" />'
+    assert read(photo(xmp=pix4d + dewarp)).drone == DroneData(
+        rtk_std=(0.015, 0.015, 0.03), calibrated_focal=3678.87
+    )
+    older = read(photo(xmp=b'<d drone-dji:CalibratedFocalLength="3666.666" />')).drone
+    assert older == DroneData(calibrated_focal=3666.666)
+
+
+def test_focal_plane_error_and_heading():
+    exif = {0xA20E: 4865.6, 0xA210: 2}
+    data = read(photo(exif=exif, gps=FULL["gps"] | {31: 6.0, 11: 2.5, 16: "T", 17: 359.2}))
+    assert data.focal_plane == pytest.approx(4865.6 / 25.4)
+    assert (data.gps_error, data.gps_dop, data.heading) == (6.0, 2.5, pytest.approx(359.2))
+    magnetic = read(photo(gps=FULL["gps"] | {16: "M", 17: 359.2}))
+    assert magnetic.heading is None
 
 
 def test_drone_with_elements_and_damage():

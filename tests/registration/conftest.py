@@ -1,6 +1,6 @@
 """A small city at two dates, and databases of known poses for routes that need no photos."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -184,3 +184,69 @@ def noisy_gps(truth: dict[str, Array], noise: float) -> dict[str, Any]:
     for name in sorted(enu)[::10]:
         enu[name][0] += 500.0
     return {"enu": enu, "sigma": {name: [noise] * 3 for name in enu}}
+
+
+@pytest.fixture
+def write_database() -> Callable[..., dict[str, Any]]:
+    """Write a database of photos, and return the arguments of a route; see `_database`."""
+    return _database
+
+
+def _database(
+    folder: Path,
+    poses: Sequence[Array],
+    points: Array,
+    sees: Sequence[NDArray[np.bool_]],
+    true: pycolmap.Camera,
+    camera: pycolmap.Camera | None = None,
+    noise: float = 0.3,
+) -> dict[str, Any]:
+    """Write keypoints and verified matches of photos.
+
+    Args:
+        folder: Of the database.
+        poses: ``cam_from_world`` of each photo.
+        points: What they show. [P, 3]
+        sees: Points that are detected in each photo, where they are in it. [P] each
+        true: Camera that the photos are taken with.
+        camera: Camera in the database; None for the true one.
+        noise: Pixels.
+    """
+    rng = np.random.default_rng(5)
+    (folder / "photos").mkdir(parents=True)
+    names = [f"{i:02d}.jpg" for i in range(len(poses))]
+    size = np.array([true.width, true.height])
+    slots: list[dict[int, int]] = []
+    with pycolmap.Database.open(str(folder / "mapping.db")) as database:
+        camera = camera or true
+        camera.has_prior_focal_length = True
+        database.write_camera(camera)
+        for name, pose, seen in zip(names, poses, sees, strict=True):
+            local = points @ pose[:3, :3].T + pose[:3, 3]
+            ahead = np.flatnonzero(seen & (local[:, 2] > 0.5))
+            xy = np.array([true.img_from_cam(p) for p in local[ahead]], np.float64).reshape(-1, 2)
+            inside = ((xy > 0) & (xy < size)).all(axis=1)
+            xy = xy[inside] + rng.normal(0, noise, (int(inside.sum()), 2))
+            image_id = database.write_image(pycolmap.Image(name=name, camera_id=1))
+            database.write_keypoints(image_id, xy.astype(np.float32))
+            slots.append({int(k): i for i, k in enumerate(ahead[inside])})
+        for i, a in enumerate(slots):
+            for j in range(i + 1, len(slots)):
+                shared = sorted(a.keys() & slots[j].keys())
+                if len(shared) >= 15:
+                    pairs = np.array([(a[k], slots[j][k]) for k in shared], np.uint32)
+                    geometry = pycolmap.TwoViewGeometry()
+                    geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                    geometry.inlier_matches = pairs
+                    database.write_matches(i + 1, j + 1, pairs)
+                    database.write_two_view_geometry(i + 1, j + 1, geometry)
+    return {
+        "database": str(folder / "mapping.db"),
+        "photos": str(folder / "photos"),
+        "periods": dict.fromkeys(names, 0),
+        "priors": None,
+        "keep_unplaced": False,
+        "out": str(folder / "model"),
+        "scratch": str(folder / "scratch"),
+        "threads": 1,
+    }

@@ -13,7 +13,7 @@ from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
-from chronoscene.registration.features.camera_groups import MIN_PHOTOS
+from chronoscene.registration.features.camera_groups import AUTO, FEW, MANY, MIN_PHOTOS
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import find_captures, read_captures
 from chronoscene.registration.pipeline import run
@@ -80,9 +80,10 @@ FAILED = 1  # Exit status if a verdict is fail
 )
 @click.option(
     "--camera-model",
-    type=click.Choice(["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]),
+    type=click.Choice([AUTO, "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]),
     default=DEFAULTS.camera_model,
-    help="Camera model of COLMAP that is fitted to the photos.",
+    help=f"Camera model of COLMAP that is fitted to the photos; auto: {MANY} for a camera with at "
+    f"least {MIN_PHOTOS} photos, else {FEW}.",
 )
 @click.option(
     "--calibration",
@@ -172,7 +173,7 @@ def command(
             say(f"note: {note}")
         raise
     text = summary(registered, out, options.crs) + "".join(i.summary for i in inspections)
-    emit(text + "".join(f"note: {note}\n" for note in found.misdated), None)
+    emit(text + "".join(f"note: {note}\n" for note in found.notes), None)
     if any(i.failed for i in inspections):
         context.exit(FAILED)
 

@@ -15,6 +15,10 @@ MIN_PHOTOS = 20
 between dates; but few photos, above all of flat ground from one height, do not determine the focal
 length, and a calibration of another date fits better."""
 
+AUTO, FEW, MANY = "auto", "SIMPLE_RADIAL", "OPENCV"
+"""Camera models of COLMAP: the choice between the other two. All photos are mapped with the first;
+`MIN_PHOTOS` of a camera determine the second (`reconstruct.lens`)."""
+
 SAME_VISIT = timedelta(days=1)
 """Time between periods up to which they count as one visit, with one calibration."""
 
@@ -48,7 +52,7 @@ def camera_groups(
         by_lens.setdefault(_lens(capture), []).append(capture)
     groups = [g for members in by_lens.values() for g in _SPLITTERS[calibration](members)]
     return [
-        {"names": sorted(names), "model": model, "params": None}
+        {"names": sorted(names), "model": FEW if model == AUTO else model, "params": None}
         for names in sorted(([c.name for c in group] for group in groups), key=min)
     ]
 

@@ -46,6 +46,15 @@ class Captures:
     remarks: tuple[str, ...]
     misdated: tuple[str, ...] = ()
     """Periods with photos that were taken at another time by their metadata, in words."""
+    left_out: tuple[str, ...] = ()
+    """Photos of which no period is known, in words."""
+    undisputed: frozenset[Path] = frozenset()
+    """Files of the photos whose own dates may date their period."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Everything to be said about periods, for the end of a command."""
+        return (*self.left_out, *self.misdated)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +88,9 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
     path, table = find_captures(Path(path), table)
     if table is not None:
         return _assemble(path, _from_table(path, table))
-    if groups := _period_folders(path):
-        return _assemble(path, groups)
+    groups, left_out = _period_folders(path)
+    if groups:
+        return _assemble(path, groups, left_out=left_out)
     return _assemble(path, *_by_date(path, photos_in(path)))
 
 
@@ -96,14 +106,32 @@ def photos_in(folder: Path) -> list[Path]:
     return sorted(found, key=lambda p: p.relative_to(folder).as_posix())
 
 
-def _period_folders(root: Path) -> list[_Listed]:
-    """List photos by subfolder; none if there are photos in the root, or only one subfolder."""
+def _period_folders(root: Path) -> tuple[list[_Listed], list[str]]:
+    """List photos by subfolder, and say which lie beside these.
+
+    None are listed with only one subfolder, or if more photos lie beside the subfolders than in
+    them: those are no periods.
+    """
     photos = photos_in(root)
-    tops = {p.relative_to(root).parts[0] for p in photos if len(p.relative_to(root).parts) > 1}
-    if len(tops) < 2 or any(p.parent == root for p in photos):
+    beside = [p for p in photos if p.parent == root]
+    inside = [p for p in photos if p.parent != root]
+    tops = {p.relative_to(root).parts[0] for p in inside}
+    if len(tops) < 2 or len(beside) > len(inside):
+        return [], []
+    listed = [
+        _Listed(p, p.relative_to(root).as_posix(), p.relative_to(root).parts[0]) for p in inside
+    ]
+    return listed, _left_out(beside, "lie beside the folders of the periods")
+
+
+def _left_out(photos: Sequence[Path], why: str) -> list[str]:
+    """Name photos without a period; nothing if there are none."""
+    if not photos:
         return []
+    names = ", ".join(p.name for p in photos[:3]) + (", ..." if len(photos) > 3 else "")
     return [
-        _Listed(p, p.relative_to(root).as_posix(), p.relative_to(root).parts[0]) for p in photos
+        f"{len(photos)} photos {why}, so their period is unknown: {names}; they are left out; move "
+        "them to the folder of their period, or give a table of images and periods (--table)"
     ]
 
 
@@ -139,29 +167,37 @@ def _in_root(root: Path, name: str) -> Path | None:
     return inner if not (root / name).exists() and inner.exists() else root / name
 
 
-def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str]]:
-    """Split photos of one folder into periods, at gaps of `PERIOD_GAP_DAYS` between dates."""
+def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str], list[str]]:
+    """Split photos of one folder into periods, at gaps of `PERIOD_GAP_DAYS` between dates.
+
+    Returns:
+        Photos with their periods, remarks, and what is said about photos without a period.
+    """
     times = {p: taken_at(p, read_exif(p)) for p in photos}
     dated = sorted((t, p) for p, t in times.items() if t is not None)
-    if not dated or len(dated) < len(photos):
-        undated = len(photos) - len(dated)
-        remark = f"{undated} of {len(photos)} photos have no date: all are treated as one period"
-        return [_Listed(p, p.relative_to(root).as_posix(), root.name) for p in photos], [remark]
+    undated = [p for p in photos if times[p] is None]
     groups: list[list[tuple[datetime, Path]]] = []
     for item in dated:
         if not groups or (item[0] - groups[-1][-1][0]).days >= PERIOD_GAP_DAYS:
             groups.append([])
         groups[-1].append(item)
+    if len(groups) < 2 and undated:
+        remark = f"{len(undated)} of {len(photos)} photos have no date: all are one period"
+        return [_Listed(p, p.relative_to(root).as_posix(), root.name) for p in photos], [remark], []
     listed = []
     for group in groups:
         label = group[0][0].date().isoformat()
         listed += [_Listed(p, p.relative_to(root).as_posix(), label) for _, p in group]
     labels = ", ".join(f"{g[0][0].date()} ({len(g)} photos)" for g in groups)
-    return listed, [f"periods proposed from the dates of the photos: {labels}"]
+    remark = f"periods proposed from the dates of the photos: {labels}"
+    return listed, [remark], _left_out(undated, "have no date")
 
 
 def _assemble(
-    root: Path, listed: Sequence[_Listed], proposed: Sequence[str] | None = None
+    root: Path,
+    listed: Sequence[_Listed],
+    proposed: Sequence[str] | None = None,
+    left_out: Sequence[str] = (),
 ) -> Captures:
     """Open all photos.
 
@@ -170,6 +206,7 @@ def _assemble(
         listed: Files with the labels of their periods.
         proposed: Remarks on periods that were proposed from dates; None for given periods, whose
             photos may contradict them.
+        left_out: What is said about photos without a period.
     """
     if not listed:
         raise _nothing(root, "no image files")
@@ -194,7 +231,7 @@ def _assemble(
     none: list[_Dated] = [[] for _ in order]
     wrong = _contradictions(order, dated) if proposed is None else none
     periods = tuple(
-        CapturePeriod(label, _period_date(label, {day for _, day in set(mine) - set(others)}))
+        CapturePeriod(label, period_date(label, {day for _, day in set(mine) - set(others)}))
         for label, mine, others in zip(order, dated, wrong, strict=True)
     )
     _check_names(root, images)
@@ -206,8 +243,18 @@ def _assemble(
         for label, mine, others in zip(order, dated, wrong, strict=True)
         if others
     )
-    remarks = (*(proposed or ()), f"periods: {shown}", *misdated)
-    return Captures(root, tuple(images), periods, tuple(refused), remarks, misdated)
+    remarks = (*(proposed or ()), f"periods: {shown}", *left_out, *misdated)
+    disputed = {name for others in wrong for name, _ in others}
+    return Captures(
+        root,
+        tuple(images),
+        periods,
+        tuple(refused),
+        remarks,
+        misdated,
+        left_out=tuple(left_out),
+        undisputed=frozenset(c.path for c in images if c.name not in disputed),
+    )
 
 
 _Dated = list[tuple[str, date]]  # Names of photos, and when they were taken
@@ -278,7 +325,7 @@ def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
     return sorted(by_label, key=natural_key)
 
 
-def _period_date(label: str, dates: Iterable[date]) -> str | None:
+def period_date(label: str, dates: Iterable[date]) -> str | None:
     """Find the day, month or year that all photos of a period share."""
     days = sorted(dates)
     if not days:

@@ -25,13 +25,23 @@ from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.images.store import place_image
 from chronoscene.io.staging import replacing, sha256_of
 from chronoscene.registration.context import Context
-from chronoscene.registration.photos.captures import Captures
+from chronoscene.registration.photos.captures import Captures, period_date
 from chronoscene.registration.photos.gps_priors import Positions, locate
 from chronoscene.registration.photos.photo import Capture
+from chronoscene.registration.photos.stated import stated
+from chronoscene.registration.result import ANOTHER_PLACE
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 
 _ORIENTATION = 0x0112
+
+ALIKE, SAME_PICTURE, MIN_CONTRAST = 8.0, 4.0, 10.0
+"""Grey levels. Photos that were read at a reduced size and differ by less are compared as a whole;
+copies of half the size and quality differ by 3.7 then, photos from a tripod at two dates by 13, and
+photos in a row by 7. Photos of so little contrast are not compared."""
+
+FAR_METRES = 2_000.0  # Between the positions of a period and all others: it is of another place
+
 _PLAIN_MODES = ("RGB", "L")
 
 
@@ -73,6 +83,44 @@ class PhotoInputs:
             "sigma": {name: found.sigma[i].tolist() for i, name in good},
         }
 
+    def focals(self) -> dict[str, tuple[float, float]]:
+        """Focal length that each photo states, in pixels, and its relative error, by name."""
+        found = ((c.name, stated(c)) for c in self.images)
+        return {name: (s.focal, s.focal_error) for name, s in found if s.focal is not None}
+
+    def far(self) -> dict[str, str]:
+        """Photos of periods that were taken at another place by their GPS, and how far off."""
+        periods = np.array([c.period for c in self.images], np.int64)
+        middles = {}
+        for p in np.unique(periods).tolist():
+            known = self.positions.enu[periods == p]
+            known = known[np.isfinite(known).all(axis=1)]
+            if len(known):
+                middles[p] = np.median(known, axis=0)
+        found = {}
+        most = max(middles, key=lambda p: int((periods == p).sum()), default=None)
+        for p, middle in middles.items():
+            if p == most and self.scene is None:
+                continue
+            others = [m for q, m in middles.items() if q != p]
+            if self.scene is not None and self.georeference is not None:
+                others.append(np.zeros(3))
+            away = min((float(np.linalg.norm(middle - m)) for m in others), default=0.0)
+            if away > FAR_METRES:
+                found[p] = f"{away / 1000:,.0f} km from the other dates by GPS: {ANOTHER_PLACE}"
+        return {c.name: found[c.period] for c in self.images if c.period in found}
+
+    def dates_of(self, registered: frozenset[str]) -> tuple[str | None, ...]:
+        """Dates of the periods, by the photos that are registered."""
+        dates = list(self.dates)
+        known = [c for c in self.images if c.taken and c.path in self.captures.undisputed]
+        for p in {c.period for c in known}:
+            mine = [c for c in known if c.period == p]
+            if not registered.issuperset(c.name for c in mine):
+                days = [c.taken.date() for c in mine if c.taken and c.name in registered]
+                dates[p] = period_date(self.labels[p], days)
+        return tuple(dates)
+
     def centres(self) -> dict[str, list[float]]:
         """Known positions of images, in one frame, by name."""
         known = {f.name: camera_centre(f.cam_from_world).tolist() for f in self.frames}
@@ -93,6 +141,8 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> PhotoIn
     stages.remark("captures", *captures.remarks, *refused)
     digests = {capture.name: sha256_of(capture.path) for capture in captures.images}
     unique, copies, notes = drop_copies(captures.images, digests)
+    unique, again, more = drop_saved_again(unique)
+    copies, notes = [*copies, *again], [*notes, *more]
     _check_enough(captures, unique, scene, context)
     label, date = _new_period(captures)
     source = unique if scene is None else _as_new_period(unique, scene, label)
@@ -250,6 +300,42 @@ def drop_copies(
     across = sum("earlier period" in reason for *_, reason in refused)
     remarks = [f"{across} photos are copies of photos from an earlier period"] if across else []
     return tuple(kept), refused, remarks
+
+
+def drop_saved_again(
+    captures: Sequence[Capture],
+) -> tuple[tuple[Capture, ...], list[tuple[str, int, str]], list[str]]:
+    """Drop photos that are pictures of an earlier period, saved again by another program.
+
+    Returns:
+        What `drop_copies` does.
+    """
+    looks = [np.frombuffer(c.look, np.uint8).astype(np.float32) for c in captures]
+    distinct = [i for i, look in enumerate(looks) if len(look) and look.std() > MIN_CONTRAST]
+    stack = np.stack([looks[i] for i in distinct]) if distinct else np.zeros((0, 1), np.float32)
+    period = np.array([captures[i].period for i in distinct], np.int64)
+    refused = []
+    for k, i in enumerate(distinct):
+        rms = np.sqrt(np.mean((stack - stack[k]) ** 2, axis=1))
+        alike = np.flatnonzero((rms < ALIKE) & (period < period[k]))
+        same = [j for j in alike.tolist() if _same_picture(captures[distinct[j]], captures[i])]
+        if same:
+            first = captures[distinct[same[0]]].name
+            reason = f"the same picture as {first}, saved again: a photo belongs to one date"
+            refused.append((captures[i].name, captures[i].period, reason))
+    gone = {name for name, *_ in refused}
+    remarks = [f"{len(gone)} photos are pictures of an earlier period, saved again"] if gone else []
+    return tuple(c for c in captures if c.name not in gone), refused, remarks
+
+
+def _same_picture(a: Capture, b: Capture) -> bool:
+    """Return True if two photos differ by their compression and size only."""
+    grey = []
+    for capture in (a, b):
+        with Image.open(capture.path) as image:
+            small = image.convert("L").resize((64, 64), Image.Resampling.BOX)
+        grey.append(np.asarray(small, np.float64))
+    return float(np.sqrt(np.mean((grey[0] - grey[1]) ** 2))) < SAME_PICTURE
 
 
 def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], list[str]]:

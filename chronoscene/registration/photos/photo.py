@@ -9,12 +9,21 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
-from chronoscene.images.exif import ExifData, read_exif, taken_at
+from chronoscene.images.exif import RTK_FIXED, RTK_FLOAT, ExifData, read_exif, taken_at
 from chronoscene.images.masks import find_masks
 from chronoscene.io.documents import plain_file
 
 GPS_SIGMA = (5.0, 5.0, 10.0)
 """Metres east, north, up, if the photo states none: a consumer receiver under open sky."""
+
+FIXED = (0.02, 0.02, 0.03)  # The same of a fixed RTK solution, at least
+FLOAT = (0.5, 0.5, 0.8)
+
+DOP_METRES = 3.0  # Error of a position by a receiver without corrections, for a dilution of 1
+LEAST_ERROR = 1.0  # Metres; an error that EXIF states is never smaller
+MAX_ERROR = 1000.0  # A larger one is a mistake
+
+LOOK_SIDE = 24
 
 MIN_SIDE = 64  # Pixels; smaller images are icons and previews
 HEAD_BYTES = 200_000  # Bytes of a file that are searched for panorama metadata
@@ -52,6 +61,8 @@ class Capture:
     gps: Gps | None
     mask: Path | None = None
     """Its mask file, in ``masks/`` beside the folder of the photos."""
+    look: bytes = b""
+    """Grey levels of the photo reduced to `LOOK_SIDE` pixels a side, by which copies are found."""
 
 
 def open_photo(path: Path, name: str, period: int) -> Capture | str:
@@ -62,6 +73,8 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
             # A JPEG is then read to its end, but decoded at a reduced size.
             image.draft("RGB", (width // 8, height // 8))
             image.load()
+            small = image.convert("L").resize((LOOK_SIDE, LOOK_SIDE), Image.Resampling.BOX)
+            look = small.tobytes()
     except Exception as error:  # Pillow raises almost anything for damaged files
         return f"cannot be decoded: {str(error) or type(error).__name__}"
     if min(width, height) < MIN_SIDE:
@@ -80,6 +93,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
         taken=taken_at(path, exif),
         gps=_position(exif),
         mask=find_masks(beside, [name]).get(name),
+        look=look,
     )
 
 
@@ -93,19 +107,34 @@ def is_panorama(path: Path) -> bool:
 def _position(exif: ExifData) -> Gps | None:
     if exif.latitude is None or exif.longitude is None:
         return None
-    drone = exif.drone
-    sigma = GPS_SIGMA
-    relative = None
-    if drone is not None:
-        relative = drone.relative_altitude
-        if drone.rtk_std is not None and all(0 < s < 100 for s in drone.rtk_std):
-            east, north, up = drone.rtk_std
-            # Stated deviations are of the antenna at the fix, not at the shutter: at least 2 cm.
-            sigma = (max(east, 0.02), max(north, 0.02), max(up, 0.03))
     return Gps(
         latitude=exif.latitude,
         longitude=exif.longitude,
         altitude=exif.altitude,
-        relative_altitude=relative,
-        sigma=sigma,
+        relative_altitude=None if exif.drone is None else exif.drone.relative_altitude,
+        sigma=gps_sigma(exif),
     )
+
+
+def gps_sigma(exif: ExifData) -> tuple[float, float, float]:
+    """Standard deviations of a position east, north and up, by what the photo states.
+
+    In this order: deviations in XMP, the kind of its RTK solution, the error or the dilution of
+    precision in EXIF. Errors of a consumer receiver are twice as large in height.
+    """
+    drone = exif.drone
+    if drone is not None and drone.rtk_std is not None and all(0 < s < 100 for s in drone.rtk_std):
+        # Stated deviations are of the antenna at the fix, not at the shutter.
+        east, north, up = (max(s, least) for s, least in zip(drone.rtk_std, FIXED, strict=True))
+        return east, north, up
+    if drone is not None and drone.rtk_flag == RTK_FIXED:
+        return FIXED
+    if drone is not None and drone.rtk_flag == RTK_FLOAT:
+        return FLOAT
+    if exif.gps_error is not None and exif.gps_error < MAX_ERROR:
+        error = max(exif.gps_error, LEAST_ERROR)
+    elif exif.gps_dop is not None and exif.gps_dop * DOP_METRES < MAX_ERROR:
+        error = max(exif.gps_dop * DOP_METRES, LEAST_ERROR)
+    else:
+        return GPS_SIGMA
+    return error, error, 2 * error

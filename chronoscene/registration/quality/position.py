@@ -1,4 +1,4 @@
-"""Absolute position of a registration in the world: measured, and judged apart from the alignment.
+"""Position and scale of a registration in the world, judged apart from the alignment.
 
 A model whose periods fit each other perfectly can be metres off in the world. Check points, which
 took no part in the estimation, measure that. Control points show only how well the model could be
@@ -20,6 +20,8 @@ from chronoscene.registration.quality.left_out import (
     not_fixed,
     precision,
 )
+from chronoscene.registration.quality.metadata import Comparison, compare_with_metadata
+from chronoscene.registration.quality.metadata import objections as contradictions
 from chronoscene.registration.quality.verdict import Level, Objection, Threshold, check, worst_level
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.control import CONTRADICTION
@@ -67,6 +69,13 @@ POSITION_THRESHOLDS: dict[str, Threshold] = {
         why="receivers err by metres; more comes from another reference system, or exchanged axes",
         todo="check the reference system of the points, and the order east, north, height",
     ),
+    "scale": Threshold(
+        what="standard deviation of the scale by GPS",
+        unit="%", doubtful=1,
+        why="lengths are as uncertain as the scale, and volumes three times as much",
+        todo="measure a distance between two spots of the scene, and give them as control; or take "
+        "photos over a larger area",
+    ),
 }  # fmt: skip
 """The fail limits of the errors are three times the doubtful ones."""
 
@@ -109,6 +118,10 @@ class Position:
     """Cameras against their GPS positions."""
     ground_pixel: float | None
     """Metres that a pixel covers, median over the surveyed points."""
+    scale_error: float | None = None
+    """Relative standard deviation of the scale by GPS."""
+    metadata: tuple[Comparison, ...] = ()
+    """The model beside what its photos state."""
     left_out: Rmse | None = None
     """Control points, each placed by an adjustment to which its coordinates are unknown."""
 
@@ -164,16 +177,33 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if points and gps is not None:
         gap = float(np.linalg.norm(np.median(_gps_errors(model)[1][:, :2], axis=0)))
         objections += check(POSITION_THRESHOLDS["gps"], gap, "ground control and GPS", "gps")
+    scale_error = None if gps is None else _scale_error(model, gps)
+    if scale_error is not None and not controlled:
+        objections += check(POSITION_THRESHOLDS["scale"], 100 * scale_error, "GPS", "scale")
+    compared = compare_with_metadata(model)
+    if found is None or found.count < POSITION_THRESHOLDS["points"].doubtful:
+        objections += contradictions(compared)  # check points measure the same, and better
     if model.resection is None or found is not None:
         objections += _unproven(found, control, gps)
     else:
         objections += not_fixed(model, POSITION_THRESHOLDS["horizontal"], pixel)
-    objections.sort(key=lambda f: f.level != "fail")
+    objections.sort(key=lambda f: (f.level != "fail", f.check != "metadata"))
     level: Level | Literal["not checked"] = worst_level(f.level for f in objections)
-    if found is None and control is None and gps is None:
+    if found is None and control is None and gps is None and not objections:
         level = "not checked"
     text = _words(level, objections, found, left_out, ties) + precision(model)
-    return Position(level, text, tuple(objections), found, control, gps, pixel, left_out)
+    return Position(
+        level,
+        text,
+        tuple(objections),
+        found,
+        control,
+        gps,
+        ground_pixel=pixel,
+        scale_error=scale_error,
+        metadata=tuple(compared),
+        left_out=left_out,
+    )
 
 
 def _of_points(points: Sequence[PointResidual]) -> Rmse | None:
@@ -208,6 +238,14 @@ def _gps_errors(model: Registered) -> tuple[list[str], Array]:
     use = np.flatnonzero(model.gps_used & np.isfinite(model.gps_enu).all(axis=1))
     errors = camera_centre(model.cam_from_world[use]) - model.gps_enu[use]
     return [model.names[i] for i in use], errors
+
+
+def _scale_error(model: Registered, gps: Rmse) -> float:
+    """Relative standard deviation of the scale, from the horizontal residuals of all positions."""
+    use = model.gps_used & np.isfinite(model.gps_enu).all(axis=1)
+    flat = model.gps_enu[use][:, :2]
+    spread = float(np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum()))
+    return gps.horizontal / max(spread, 1e-9)
 
 
 def _errors(place: str, rmse: Rmse | None, pixel: float | None) -> Iterator[Objection]:
@@ -267,6 +305,8 @@ def _words(
     start = (
         "The model does not lie where surveyed points are."
         if level == "fail"
+        else "The model contradicts what its photos state; its lengths and heights may be wrong."
+        if first.check == "metadata"
         else "The position may be correct, but nothing independent proves it."
         if first.check == "independent"
         else "The position is not proven to the precision of the photos."

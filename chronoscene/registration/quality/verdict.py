@@ -8,7 +8,7 @@ registration fails only where a measurement contradicts it; everything between i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from chronoscene.registration.quality.gps_fit import PeriodGpsFit
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import MIN_TRACKS, Misalignment
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
+from chronoscene.registration.result import ANOTHER_PLACE
 
 Level = Literal["pass", "doubtful", "fail"]
 
@@ -50,7 +51,11 @@ _CLICK = (
     "click tie points on the spots that the page (--report) suggests, and run again with "
     "--tie-points"
 )
-_LOOK = f"look at the comparisons on the page (--report); if they jump, {_CLICK}"
+_LOOK = (
+    "look at the comparisons on the page (--report); if flat ground that did not change jumps in "
+    f"most of them, {_CLICK}"
+)
+_PLACE = "check that the photos show this place; leave out those that do not"
 _CONTROL = "give ground control: --tie-points with world coordinates"
 
 THRESHOLDS: dict[str, Threshold] = {
@@ -271,7 +276,9 @@ def check(
 
 def _of_period(p: PeriodFigures) -> Iterator[Objection]:
     place = f"period {p.label}"
-    yield from _check("registered", p.registered / max(p.photos, 1), place)
+    for found in _check("registered", p.registered / max(p.photos, 1), place):
+        far = [reason for reason in p.reasons if reason.endswith(ANOTHER_PLACE)]
+        yield replace(found, found=f"{found.found}; {far[0]}", todo=_PLACE) if far else found
     yield from _check("images", p.registered, place)
     if isinstance(p.gps, PeriodGpsFit):
         gps = p.gps
@@ -387,12 +394,18 @@ def _links(
     """
     names = certificate.labels
     some = _bounds(certificate, [k for k, level in pairs.items() if level is not None])
+    far = {
+        p.period
+        for p in certificate.periods
+        if any(reason.endswith(ANOTHER_PLACE) for reason in p.reasons)
+    }
     for (a, b), level in pairs.items():
         place = f"periods {names[a]} and {names[b]}"
         if not np.isfinite(some[a, b]):
             yield Objection(
                 "fail", "link", place, "no measurement links them",
-                "without matches between them, their alignment is unknown", _CLICK,
+                "without matches between them, their alignment is unknown",
+                _PLACE if {a, b} & far else _CLICK,
             )  # fmt: skip
         elif level is None and not good[a, b] <= 1:
             left = (

@@ -28,6 +28,10 @@ FINAL_PIXELS = 8.0  # Residual of an inlier in the end
 
 MIN_INLIERS = 15  # Fewer do not fix a similarity that can be trusted
 MIN_CELLS = 4  # Neither do many in fewer places than these
+MAX_SCALE = 50.0
+"""Models of a mapper have about one size. One that fits another at a much smaller or larger scale
+has shrunk to a point of it."""
+
 CELLS_PER_AXIS = 12  # Along each of the two directions in which the points spread most
 QUANTILE = 0.02  # Points outside of this quantile and its mirror image do not stretch the grid
 
@@ -72,8 +76,10 @@ class Alignment:
 
     @property
     def is_trustworthy(self) -> bool:
-        """True if enough pairs in enough places agree."""
-        return int(self.inliers.sum()) >= MIN_INLIERS and self.cells >= MIN_CELLS
+        """True if enough pairs in enough places agree, at a scale that is not absurd."""
+        scale = self.target_from_source.scale
+        sane = 1 / MAX_SCALE < scale < MAX_SCALE
+        return int(self.inliers.sum()) >= MIN_INLIERS and self.cells >= MIN_CELLS and sane
 
 
 def align_by_points(pairs: PointPairs) -> Alignment | None:

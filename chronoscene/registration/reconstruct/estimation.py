@@ -18,8 +18,10 @@ from chronoscene.arrays import Ints
 from chronoscene.colmap.model import read_model
 from chronoscene.errors import RegistrationError
 from chronoscene.registration.context import Context
+from chronoscene.registration.features.camera_groups import AUTO
 from chronoscene.registration.features.correspondences import Matched
 from chronoscene.registration.photos.inputs import PhotoInputs
+from chronoscene.registration.photos.stated import stated
 from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered, Route
 from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
@@ -118,11 +120,14 @@ def _run_route(route: Route, inputs: PhotoInputs, matched: Matched, context: Con
     else:
         settings["priors"] = inputs.priors() if inputs.georeference else None
         settings["keep_unplaced"] = context.options.tie_points is not None
+        settings["focals"] = inputs.focals()
+        settings["full_lens"] = context.options.camera_model == AUTO
     result = _estimate(route, route, settings, context)
     registered = _assemble(route, route, result, inputs, context)
     missing = set(inputs.periods) - set(registered.names)
     lost = reasons(missing, matched.keypoints, matched.partners, result["left"])
     lost |= dict.fromkeys(missing & matched.absent, "not in the file of features")
+    lost |= {name: reason for name, reason in inputs.far().items() if name in lost}
     registered = replace(registered, unplaced=frozenset(result["unplaced"]))
     return _with_lost(registered, lost, inputs)
 
@@ -131,7 +136,8 @@ def refined(
     registered: Registered, arguments: Mapping[str, Any], inputs: PhotoInputs, context: Context
 ) -> Registered:
     """A registration adjusted again after tie points have moved its periods."""
-    result = _estimate("refine", "refined", dict(arguments), context)
+    settings = dict(arguments) | {"short": registered.short, "held": registered.held}
+    result = _estimate("refine", "refined", settings, context)
     again = _assemble(registered.route, "refined", result, inputs, context)
     lost = set(registered.names) - set(again.names)
     reason = "lost when the model was adjusted with tie points"
@@ -202,10 +208,13 @@ def _assemble(
         georeference=inputs.georeference if georeferenced else None,
         num_periods=len(inputs.labels),
         labels=inputs.labels,
-        dates=inputs.dates,
+        dates=inputs.dates_of(frozenset(names)),
         held_out=cross_matches(tracks, periods),
         held_out_tracks=tracks,
         images_root=str(context.photos),
+        stated={c.name: stated(c) for c in inputs.images},
+        short=result["short"],
+        held=result["held"],
     )
 
 
@@ -289,12 +298,16 @@ def reasons(
         if count < FEW_FEATURES:
             found[name] = f"only {count} features: blurred, dark, or without texture"
         elif name in part_of:
-            found[name] = f"in a submodel of {part_of[name]} images that could not be placed"
+            found[name] = (
+                f"in a submodel of {part_of[name]} images that could not be placed; photos that "
+                "show both it and the rest would connect it"
+            )
         elif not matched:
             found[name] = f"none of its {count} features are matched in any other photo"
         else:
             found[name] = (
-                f"matched with {matched} photos, but too few of the matches agree on a pose"
+                f"matched with {matched} photos, but too few of the matches agree on a pose; "
+                "photos between this one and its neighbours, half a step apart, would connect it"
             )
     return found
 

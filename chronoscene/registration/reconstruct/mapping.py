@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,13 @@ import numpy as np
 
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features.database import SEED, quiet
+from chronoscene.registration.features.database import SEED, quiet, verified_matches
+from chronoscene.registration.reconstruct.candidates import (
+    SHORT_ANGLE,
+    allow_short_tracks,
+    support,
+    without_weak_pairs,
+)
 from chronoscene.registration.reconstruct.gps_alignment import Priors
 from chronoscene.registration.reconstruct.models import summary, write_model
 
@@ -31,7 +37,7 @@ FUNCTION_TOLERANCE = 1e-6
 """Bundle adjustment ends after so many steps, or at a smaller relative decrease of the cost."""
 
 MAX_REPROJECTION_ERROR = 4.0  # Pixels; observations that are further off are dropped
-MIN_TRI_ANGLE = 1.5  # Degrees; points whose rays meet at smaller angles are dropped
+MIN_TRI_ANGLE = 1.5  # Degrees; points whose rays meet at smaller angles are dropped, usually
 
 SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("default", {}),
@@ -48,7 +54,7 @@ SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Task:
     """Arguments and remarks that the functions of one task share."""
 
@@ -61,6 +67,17 @@ class Task:
     report: Report
     remarks: list[str]
     """For the log; added to."""
+    periods: Mapping[str, int]
+    """Period of each image."""
+    short: bool = False
+    """True if points of two images and of small angles count (`candidates`)."""
+    held: bool = False
+    """True if focal lengths stay as they are in the database (`focal`)."""
+
+    @property
+    def min_angle(self) -> float:
+        """Degrees; points whose rays meet at smaller angles are dropped."""
+        return SHORT_ANGLE if self.short else MIN_TRI_ANGLE
 
     @classmethod
     def start(cls, arguments: Mapping[str, Any], report: Report) -> Task:
@@ -68,7 +85,18 @@ class Task:
         quiet()
         database, photos, threads = (arguments[k] for k in ("database", "photos", "threads"))
         out, scratch = Path(arguments["out"]), Path(arguments["scratch"])
-        return cls(database, photos, out, scratch, threads, report, [])
+        return cls(
+            database,
+            photos,
+            out,
+            scratch,
+            threads,
+            report,
+            remarks=[],
+            periods=arguments.get("periods", {}),
+            short=arguments.get("short", False),
+            held=arguments.get("held", False),
+        )
 
     def finish(self, model: pycolmap.Reconstruction, **result: Any) -> dict[str, Any]:
         """Write the model, and return the result of the task, as JSON."""
@@ -80,6 +108,8 @@ class Task:
             "model": summary(model),
             "left": [],
             "unplaced": [],
+            "short": self.short,
+            "held": self.held,
         } | result
 
 
@@ -88,26 +118,44 @@ def map_images(
 ) -> list[pycolmap.Reconstruction]:
     """Map images with several settings; the best result, its largest model first.
 
+    Where the usual settings register most images, they count. Else the matches choose.
+
     Args:
         task: The task.
         names: Images to map.
         label: Prefix of the remarks, and folder below the scratch folder.
     """
-    best: list[pycolmap.Reconstruction] = []
+    found = []
+    folder = task.scratch / label
     for number, (kind, settings) in enumerate(SETTINGS):
-        options = pipeline_options(task)
-        options.image_names = list(names)
-        for key, value in settings.items():
-            setattr(options.mapper, key, value)
-        models = _run(task, task.scratch / label / f"mapping-{number}", options, len(names))
-        sizes = [int(m.num_reg_images()) for m in models]
-        remark = f"mapping with {kind} settings: models of {sizes or 'no'} images"
-        task.remarks.append(f"{label.replace('-', ' ')}: {remark}" if label else remark)
-        if sum(sizes[:1]) > sum(m.num_reg_images() for m in best[:1]):
-            best = models
-        if best and best[0].num_reg_images() >= SATISFIED * len(names):
-            break
-    return best
+        models = _run(task, folder / f"mapping-{number}", names, settings)
+        found.append((kind, task, models))
+        _note(task, f"mapping with {kind} settings", models, label)
+        if models and models[0].num_reg_images() >= SATISFIED * len(names):
+            return models
+    certain = replace(task, database=str(folder / "certain.db"), short=True)
+    if weak := without_weak_pairs(task.database, folder / "certain.db", task.periods):
+        task.remarks.append(
+            f"{weak} pairs of photos of two dates left out: few matches, none confirmed by others"
+        )
+    short = _run(certain, folder / "short", names, SETTINGS[-1][1])
+    overall = _disjoint(map_globally(certain, folder / "global", names))
+    for kind, models in (("short tracks", short), ("the global mapper", overall)):
+        found.append((kind, certain, models))
+        _note(task, f"mapping with {kind}", models, label)
+    _, matches = verified_matches(certain.database)
+    kind, best, models = max(found, key=lambda f: support(f[2][0], matches) if f[2] else 0)
+    if models:
+        task.remarks.append(f"{kind}: chosen, as most matches agree with it")
+        task.database, task.short = best.database, best.short
+    return models
+
+
+def _note(task: Task, kind: str, models: Sequence[pycolmap.Reconstruction], label: str) -> None:
+    """Log what an attempt gave."""
+    sizes = [int(m.num_reg_images()) for m in models]
+    remark = f"{kind}: models of {sizes or 'no'} images"
+    task.remarks.append(f"{label.replace('-', ' ')}: {remark}" if label else remark)
 
 
 def pipeline_options(task: Task) -> pycolmap.IncrementalPipelineOptions:
@@ -121,20 +169,44 @@ def pipeline_options(task: Task) -> pycolmap.IncrementalPipelineOptions:
     options.extract_colors = False  # those of the final model are extracted when it is written
     options.ba_global_frames_ratio = 1.2
     options.ba_global_points_ratio = 1.2
+    options.ba_refine_focal_length = not task.held
+    if task.short:
+        allow_short_tracks(options)
     return options
 
 
 def _run(
-    task: Task, out: Path, options: pycolmap.IncrementalPipelineOptions, total: int
+    task: Task, out: Path, names: Sequence[str], settings: Mapping[str, Any]
 ) -> list[pycolmap.Reconstruction]:
-    """Run the mapper; disjoint models, the largest first."""
+    """Run the incremental mapper; disjoint models, the largest first."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    count = _counter(task.report, "mapping", total)
+    options = pipeline_options(task)
+    options.image_names = list(names)
+    for key, value in settings.items():
+        setattr(options.mapper, key, value)
+    if task.short:
+        allow_short_tracks(options)
+    count = _counter(task.report, "mapping", len(names))
     models = pycolmap.incremental_mapping(
         task.database, task.photos, str(out), options, next_image_callback=count
     )
     return _disjoint(sorted(models.values(), key=lambda m: -m.num_reg_images()))
+
+
+def map_globally(task: Task, out: Path, names: Sequence[str]) -> list[pycolmap.Reconstruction]:
+    """Map images by rotation averaging and global positioning; models, the largest first."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.image_names = list(names)
+    options.image_path = task.photos
+    options.random_seed = SEED
+    options.num_threads = options.mapper.num_threads = task.threads
+    options.mapper.bundle_adjustment.refine_focal_length = not task.held
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    task.report("global mapping", 0, 1)
+    models = pycolmap.global_mapping(task.database, task.photos, str(out), options)
+    return sorted(models.values(), key=lambda m: -m.num_reg_images())
 
 
 def _counter(report: Report, what: str, total: int) -> Callable[[], None]:
@@ -211,18 +283,18 @@ def triangulate(model: pycolmap.Reconstruction, task: Task, folder: str) -> pyco
 
 def adjust(
     model: pycolmap.Reconstruction,
+    task: Task,
     *,
     priors: Priors | None = None,
     constant: Collection[int] = (),
-    threads: int = 1,
 ) -> str:
     """Adjust a model with a robust loss, then drop bad observations.
 
     Args:
         model: Changed in place.
+        task: Its threads, and what it holds.
         priors: Position priors of images, with a robust loss; the model must lie in their frame.
         constant: Ids of images whose poses and cameras must not change.
-        threads: Of the solver.
 
     Returns:
         Why the solver stopped.
@@ -231,7 +303,8 @@ def adjust(
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_PIXELS
-    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.num_threads = task.threads
+    options.refine_focal_length = not task.held
     options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
     options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     config = pycolmap.BundleAdjustmentConfig()
@@ -250,7 +323,7 @@ def adjust(
     solved = adjuster.solve()
     # Drop observations with a large error, and points with a small triangulation angle.
     manager = pycolmap.ObservationManager(model)
-    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, MIN_TRI_ANGLE)
+    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, task.min_angle)
     manager.filter_observations_with_negative_depth()
     model.update_point_3d_errors()
     return str(solved.termination_type.name)

@@ -17,13 +17,16 @@ from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.control.adjustment import add_point, adjust_with_control, drop_bad
 from chronoscene.registration.features.database import verified_matches
+from chronoscene.registration.reconstruct.candidates import copy_database
 from chronoscene.registration.reconstruct.consistency import (
     Matches,
     agreement,
     deregister_misplaced,
     pair_agreements,
 )
+from chronoscene.registration.reconstruct.focal import hold_focals
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
+from chronoscene.registration.reconstruct.lens import with_full_lens
 from chronoscene.registration.reconstruct.mapping import (
     Task,
     adjust,
@@ -48,13 +51,25 @@ def joint(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Map all images together; submodels that did not connect are merged afterwards.
 
     Arguments: ``database``, ``photos``, ``periods`` (by name), ``priors`` (``enu`` and ``sigma`` by
-    name, or null), ``keep_unplaced`` (see `submodels.combine`), ``out`` (model folder),
-    ``scratch``, ``threads``.
+    name, or null), ``focals`` (see `focal.Focals`), ``full_lens`` (see `lens`), ``keep_unplaced``
+    (see `submodels.combine`), ``out`` (model folder), ``scratch``, ``threads``.
     """
     task = Task.start(arguments, report)
-    models = map_images(task, sorted(arguments["periods"]))
+    models = _mapped(task, sorted(arguments["periods"]), arguments)
     submodels = [Submodel(f"submodel {i}", model) for i, model in enumerate(models)]
     return _merged(submodels, arguments, task)
+
+
+def _mapped(
+    task: Task, names: Sequence[str], arguments: Mapping[str, Any], label: str = ""
+) -> list[pycolmap.Reconstruction]:
+    """Models of images, with the focal lengths that photos state where images leave them open."""
+
+    def again(held: Task) -> list[pycolmap.Reconstruction]:
+        return map_images(held, names, label=f"{label}-held".strip("-"))
+
+    models = map_images(task, names, label=label)
+    return hold_focals(task, models, arguments.get("focals", {}), again)
 
 
 def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -64,9 +79,9 @@ def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     submodels = []
     for period in sorted(set(periods.values())):
         names = sorted(n for n, p in periods.items() if p == period)
-        models = map_images(task, names, label=f"period-{period}")
+        models = _mapped(task, names, arguments, f"period-{period}")
         for i, model in enumerate(models):
-            adjust(model, threads=task.threads)
+            adjust(model, task)
             label = f"period {period}" + (f" submodel {i}" if len(models) > 1 else "")
             submodels.append(Submodel(label, model, period, is_largest=i == 0))
     return _merged(submodels, arguments, task)
@@ -90,7 +105,7 @@ def _merged(
     if len(submodels) == 1:
         combined = Combined(submodels[0].model, (), (), ())
         model = combined.model
-        adjust(model, threads=task.threads)
+        adjust(model, task)
     else:
         task.report("aligning", 0, 1)
         combined = combine(submodels, matches, priors, task.database, keep_unplaced=keep_unplaced)
@@ -99,14 +114,16 @@ def _merged(
         for i in range(ROUNDS):
             task.report("adjusting", i, ROUNDS)
             model = triangulate(model, task, "points")
-            adjust(model, threads=task.threads)
+            adjust(model, task)
     if not keep_unplaced:  # periods that wait for tie points would contradict the others
         model = _settled(model, matches, len(arguments["periods"]), task)
+    if arguments.get("full_lens", False):
+        model = with_full_lens(model, task, arguments.get("focals", {}))
     task.report("adjusting", 0, 1)
     placed, used = to_gps_frame(model, priors, task.remarks)
     if placed:
         before = summary(model)["reprojection_error_px"]
-        ended = adjust(model, priors=used, threads=task.threads)
+        ended = adjust(model, task, priors=used)
         after = summary(model)["reprojection_error_px"]
         task.remarks.append(
             f"bundle adjustment with {len(used.enu)} position priors: {ended.lower()}, "
@@ -129,7 +146,7 @@ def _settled(
         model = _complete(model, total, task)
         if not deregister_misplaced(model, matches, task.remarks):
             break
-        adjust(model, threads=task.threads)
+        adjust(model, task)
     return model
 
 
@@ -142,7 +159,7 @@ def _complete(model: pycolmap.Reconstruction, total: int, task: Task) -> pycolma
     added = int(fuller.num_reg_images()) - before
     if added <= 0:
         return model
-    adjust(fuller, threads=task.threads)
+    adjust(fuller, task)
     task.remarks.append(f"{added} more images registered with the merged model")
     return fuller
 
@@ -198,7 +215,7 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             "together",
         )
     report("adjusting", 0, 1)
-    ended = adjust(model, constant=old, threads=task.threads)
+    ended = adjust(model, task, constant=old)
     moved = _max_change(model, poses)
     task.remarks.append(f"{len(new)} new images registered")
     task.remarks.append(
@@ -210,25 +227,31 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Triangulate at given poses, add tie points, adjust, and write the model.
 
-    Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (parameters by
-    name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``control`` (see
-    `adjustment.adjust_with_control`), ``out``, ``scratch``, ``threads``.
+    Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (model and
+    parameters by name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``control`` (see
+    `adjustment.adjust_with_control`), ``out``, ``scratch``, ``threads``, ``short`` and ``held`` (of
+    the model before).
     """
     task = Task.start(arguments, report)
+    cameras: Mapping[str, tuple[str, list[float]]] = arguments["cameras"]
+    images = known_images(task.database).images.values()
+    found = {i.camera_id: cameras[str(i.name)] for i in images if str(i.name) in cameras}
+    copy_database(task.database, task.scratch / "refined.db", found)
+    task.database = str(task.scratch / "refined.db")
     model = known_images(task.database)
-    for image_id in set_poses(model, arguments["poses"]):
-        image = model.images[image_id]
-        model.cameras[image.camera_id].params = arguments["cameras"][str(image.name)]
+    set_poses(model, arguments["poses"])
     for i in range(2):
         report("adjusting", i, 2)
         model = triangulate(model, task, "")
         for tie in arguments["ties"]:
             add_point(model, tie)
         if arguments["control"]:
-            adjust_with_control(model, arguments["control"], threads=task.threads)
-            drop_bad(model)
+            adjust_with_control(
+                model, arguments["control"], hold_focal=task.held, threads=task.threads
+            )
+            drop_bad(model, task.min_angle)
         else:
-            adjust(model, threads=task.threads)
+            adjust(model, task)
     counts = f"{len(arguments['ties'])} tie points and {len(arguments['control'])} control points"
     task.remarks.append(f"adjusted with {counts}")
     return task.finish(model)

@@ -182,6 +182,8 @@ def to_json(
                 "control_points_left_out": _rmse(position.left_out),
                 "cameras_against_gps": _rmse(position.gps),
                 "ground_pixel": position.ground_pixel,
+                "scale_error": position.scale_error,
+                "metadata": [asdict(c) for c in position.metadata],
             },
             "route": certificate.route,
             "features": certificate.features,

@@ -76,7 +76,7 @@ def render_report(
         drawn=_drawn(model, certificate, photos),
         photo_width=PHOTO_WIDTH,
         flickers=_flickers(model, certificate, photos),
-        clicks=_clicks(model, certificate, verdict),
+        clicks=_clicks(model, certificate, verdict, photos),
         ties=ties,
         thresholds=[*THRESHOLDS.values(), *POSITION_THRESHOLDS.values()],
         unregistered=sorted(model.unregistered.items()),
@@ -149,7 +149,7 @@ def _flickers(model: Registered, certificate: Certificate, photos: Photos) -> li
 
 
 def _clicks(
-    model: Registered, certificate: Certificate, verdict: Verdict
+    model: Registered, certificate: Certificate, verdict: Verdict, photos: Photos
 ) -> list[tuple[str, list[list[tuple[str, str, float, float]]]]]:
     """Suggest places to click, for each pair of periods that did not pass."""
     found = []
@@ -157,9 +157,11 @@ def _clicks(
     for pair in certificate.pairs:
         if verdict.pairs.get((pair.a, pair.b)) == "pass":
             continue
-        chosen = spots(model, seen, pair, CLICKS, gaps=True, twice=True)
+        listed = spots(model, seen, pair, 3 * CLICKS, gaps=True, twice=True)
+        chosen = [s for s in listed if photos.is_textured(s)][:CLICKS]
         if len(chosen) < CLICKS:
-            chosen += spots(model, seen, pair, CLICKS - len(chosen), gaps=False, twice=True)
+            listed = spots(model, seen, pair, 3 * CLICKS, gaps=False, twice=True)
+            chosen += [s for s in listed if photos.is_textured(s)][: CLICKS - len(chosen)]
         if chosen:
             clicks = [_click(model, certificate, pair, s) for s in chosen]
             found.append((_names(certificate, pair), clicks))

@@ -24,6 +24,9 @@ MAGNIFIED = 1.5  # Pixels of a patch for one of the photo
 
 PHOTO_WIDTH = 460
 
+REACH = 15  # Pixels around a spot that are looked at
+MIN_CONTRAST = 5.0  # Standard deviation of grey levels; clear sky has one or two
+
 MAP_WIDTH = 720.0  # Units of the drawing
 MAX_DOTS = 1500  # Points of the scene that are drawn
 
@@ -56,6 +59,19 @@ class Photos:
         picture = Image.fromarray(pixels)
         height = round(picture.height * PHOTO_WIDTH / picture.width)
         return data_uri(picture.resize((PHOTO_WIDTH, height), Image.Resampling.BICUBIC))
+
+    def is_textured(self, spot: Spot) -> bool:
+        """True if both images show something to click at a spot: no sky, no blank wall."""
+        views = ((spot.a, spot.xy_a), (spot.b, spot.xy_b))
+        return all(self._contrast(index, xy) > MIN_CONTRAST for index, xy in views)
+
+    def _contrast(self, index: int, xy: Array) -> float:
+        pixels = self._load(index)
+        if pixels is None:
+            return np.inf
+        x, y = (int(v) for v in xy)
+        window = pixels[max(y - REACH, 0) : y + REACH + 1, max(x - REACH, 0) : x + REACH + 1]
+        return float(window.mean(axis=2).std()) if window.size else 0.0
 
     def patches(self, spot: Spot) -> tuple[str, str] | None:
         """The same square of the surface at a spot from both images, drawn to one scale."""
@@ -148,7 +164,9 @@ def camera_map(model: Registered) -> CameraMap:
 
     forward = model.cam_from_world[:, 2, :3] @ axes.T
     at, tips = draw(plan), draw(plan) + TICK * forward * [1, -1]
-    gps = draw(model.gps_enu @ axes.T)
+    # Without a georeference, positions are in another frame than the cameras.
+    known = model.gps_enu if model.georeference is not None else np.full_like(model.gps_enu, np.nan)
+    gps = draw(known @ axes.T)
     cameras = []
     for i, name in enumerate(model.names):
         vector = gps[i] - at[i]

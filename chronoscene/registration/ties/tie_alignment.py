@@ -293,7 +293,7 @@ def refine_arguments(
     named = list(zip(model.names, model.cam_from_world, model.cameras, strict=True))
     return {
         "poses": {name: pose[:3].tolist() for name, pose, _ in named},
-        "cameras": {name: list(camera.params) for name, _, camera in named},
+        "cameras": {name: [camera.model, list(camera.params)] for name, _, camera in named},
         "ties": ties,
         "control": control_arguments(model, points, sorted(used)),
     }

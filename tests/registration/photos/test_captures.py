@@ -54,13 +54,38 @@ def test_weeks_count_from_one_photo_to_the_next(tmp_path: Path) -> None:
     assert [c.period for c in read_captures(tmp_path).images] == [0, 0, 0, 0, 1]
 
 
-def test_one_folder_with_an_undated_photo_is_one_period(tmp_path: Path) -> None:
+def test_an_undated_photo_does_not_turn_all_periods_into_one(tmp_path: Path) -> None:
     photo(tmp_path / "a.jpg", taken="2016:09:01 12:00:00")
     photo(tmp_path / "b.jpg", taken="2019:09:01 12:00:00")
     photo(tmp_path / "c.jpg")
     found = read_captures(tmp_path)
-    assert len(found.periods) == 1
-    assert "1 of 3 photos have no date" in " ".join(found.remarks)
+    assert [(c.name, c.period) for c in found.images] == [("a.jpg", 0), ("b.jpg", 1)]
+    (note,) = found.notes
+    assert "1 photos have no date, so their period is unknown: c.jpg" in note
+    assert "--table" in note and note in found.remarks
+
+
+def test_undated_photos_of_one_visit_are_of_that_period(tmp_path: Path) -> None:
+    photo(tmp_path / "a.jpg", taken="2016:09:01 12:00:00")
+    photo(tmp_path / "b.jpg")
+    found = read_captures(tmp_path)
+    assert len(found.periods) == 1 and len(found.images) == 2 and not found.notes
+
+
+def test_a_stray_photo_does_not_hide_the_folders_of_the_periods(tmp_path: Path) -> None:
+    for name in ("2016/a.jpg", "2023/b.jpg", "map.png"):
+        photo(tmp_path / name)
+    found = read_captures(tmp_path)
+    assert [c.name for c in found.images] == ["2016/a.jpg", "2023/b.jpg"]
+    assert [p.label for p in found.periods] == ["2016", "2023"]
+    assert "1 photos lie beside the folders of the periods" in found.notes[0]
+    assert "map.png" in found.notes[0]
+
+
+def test_folders_with_fewer_photos_than_lie_beside_them_are_no_periods(tmp_path: Path) -> None:
+    for name in ("x/a.jpg", "y/b.jpg", "1.jpg", "2.jpg", "3.jpg"):
+        photo(tmp_path / name)
+    assert len(read_captures(tmp_path).periods) == 1
 
 
 def test_dates_in_file_names_count_where_exif_has_none(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 from PIL import Image
 
 from chronoscene.registration.photos import inputs
-from chronoscene.registration.photos.captures import read_captures
+from chronoscene.registration.photos.captures import Captures, read_captures
+from chronoscene.registration.photos.gps_priors import locate
+from chronoscene.registration.photos.photo import Capture, Gps
+from chronoscene.registration.result import ANOTHER_PLACE
 
 
 @pytest.fixture
@@ -85,3 +89,74 @@ def test_a_photo_belongs_to_one_period(folder: Path) -> None:
     ((name, period, reason),) = refused
     assert (name, period) == ("1/copy.jpg", 1)
     assert reason.startswith("the same file as 0/a.jpg in an earlier period")
+
+
+def test_the_same_picture_saved_again_is_no_photo_of_another_date(folder: Path) -> None:
+    for name, seed in (("0/a.jpg", 0), ("0/b.jpg", 1), ("1/own.jpg", 2)):
+        save(folder / name, seed)
+        with Image.open(folder / name) as image:  # photos are smoother than noise
+            large = image.resize((960, 720), Image.Resampling.BICUBIC)
+        large.save(folder / name, quality=95)
+    with Image.open(folder / "0/a.jpg") as image:
+        image.resize((800, 600)).save(folder / "1/smaller.png")
+    with Image.open(folder / "0/b.jpg") as image:
+        image.save(folder / "1/worse.jpg", quality=60)
+    kept, refused, remarks = inputs.drop_saved_again(read_captures(folder).images)
+    assert [c.name for c in kept] == ["0/a.jpg", "0/b.jpg", "1/own.jpg"]
+    assert [(name, period) for name, period, _ in refused] == [
+        ("1/smaller.png", 1),
+        ("1/worse.jpg", 1),
+    ]
+    assert "the same picture as 0/a.jpg, saved again" in refused[0][2]
+    assert remarks == ["2 photos are pictures of an earlier period, saved again"]
+
+
+def gathered(images: tuple[Capture, ...], captures: Captures) -> inputs.PhotoInputs:
+    return inputs.PhotoInputs(
+        captures=captures,
+        scene=None,
+        images=images,
+        periods={c.name: c.period for c in images},
+        labels=("before", "after"),
+        dates=tuple(p.date for p in captures.periods),
+        refused={},
+        positions=locate(images),
+        georeference=None,
+    )
+
+
+def placed(capture: Capture, latitude: float) -> Capture:
+    number = int(capture.path.stem)
+    gps = Gps(latitude, 11.0 + 1e-4 * number, 100.0, None, (5.0, 5.0, 10.0))
+    return replace(capture, gps=gps)
+
+
+def test_a_period_of_another_place_is_said_to_be_one(folder: Path) -> None:
+    for i in range(8):
+        save(folder / ("before", "after")[i // 4] / f"{i}.jpg", i)
+    captures = read_captures(folder)
+    near = tuple(placed(c, 51.0 + 1e-3 * c.period) for c in captures.images)
+    assert gathered(near, captures).far() == {}
+    apart = tuple(placed(c, 51.0 + 20.0 * c.period) for c in captures.images)
+    found = gathered(apart, captures).far()
+    assert {name.split("/")[0] for name in found} == {"before"}  # it comes second
+    assert next(iter(found.values())).startswith("2,217 km")
+    assert next(iter(found.values())).endswith(ANOTHER_PLACE)
+
+
+def test_photos_that_are_not_registered_do_not_date_a_period(folder: Path) -> None:
+    days = {
+        "before/0.jpg": "2016:03:01",
+        "before/1.jpg": "2016:03:01",
+        "before/2.jpg": "2016:09:09",
+    }
+    for i, name in enumerate([*days, "after/3.jpg"]):
+        exif = Image.Exif()
+        if name in days:
+            exif.get_ifd(0x8769)[0x9003] = f"{days[name]} 12:00:00"
+        save(folder / name, i, exif=exif)
+    captures = read_captures(folder)
+    found = gathered(captures.images, captures)
+    first = [p.label for p in captures.periods].index("before")
+    assert found.dates_of(frozenset(c.name for c in captures.images))[first] == "2016"
+    assert found.dates_of(frozenset({"before/0.jpg", "before/1.jpg"}))[first] == "2016-03-01"

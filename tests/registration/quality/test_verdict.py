@@ -26,7 +26,8 @@ from chronoscene.registration.quality.localisation import Excess, Localisation
 from chronoscene.registration.quality.misalignment import Interval, Misalignment
 from chronoscene.registration.quality.overlap import TieSpread
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
-from chronoscene.registration.quality.verdict import Verdict, judge
+from chronoscene.registration.quality.verdict import Verdict, _of_period, judge
+from chronoscene.registration.result import ANOTHER_PLACE
 from chronoscene.scene.similarity import Sim3
 
 Change = Callable[[Certificate, float], Certificate]
@@ -436,3 +437,16 @@ def test_the_worst_comes_first_and_is_what_the_text_names() -> None:
     doubtful = judge(with_period(made(), photos=50))
     assert "Period May 2017: share of the photos" in doubtful.text
     assert "do not prove it" in doubtful.text
+
+
+def test_another_place_is_not_told_to_add_viewpoints_between() -> None:
+    figures = {
+        reason: PeriodFigures(1, "b", 0, 20, {reason: 20}, None, 0, "none")
+        for reason in ("too few matches", f"2,415 km from the other dates by GPS: {ANOTHER_PLACE}")
+    }
+    usual, far = (
+        next(o for o in _of_period(p) if o.check == "registered") for p in figures.values()
+    )
+    assert "viewpoints between" in usual.todo
+    assert "2,415 km" in far.found and "check that the photos show this place" in far.todo
+    assert "viewpoints" not in far.todo

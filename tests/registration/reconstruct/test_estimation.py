@@ -73,7 +73,9 @@ def test_photos_without_a_pose_have_reasons() -> None:
     found = reasons(missing, keypoints, partners, [["apart", "another"]])
     assert found == {
         "alone": "none of its 500 features are matched in any other photo",
-        "apart": "in a submodel of 2 images that could not be placed",
+        "apart": "in a submodel of 2 images that could not be placed; photos that show both it and "
+        "the rest would connect it",
         "dark": "only 12 features: blurred, dark, or without texture",
-        "odd": "matched with 3 photos, but too few of the matches agree on a pose",
+        "odd": "matched with 3 photos, but too few of the matches agree on a pose; photos between "
+        "this one and its neighbours, half a step apart, would connect it",
     }

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,3 +133,78 @@ def test_priors_are_as_uncertain_along_each_axis_as_their_residuals(
     moved, priors = to_gps_frame(model, Priors(enu, dict.fromkeys(names, [0.01] * 3)), [])
     assert moved and len(priors.sigma) > 35
     np.testing.assert_allclose(list(priors.sigma.values()), 0.5, rtol=0.25)
+
+
+def flight(rng: np.random.Generator) -> Array:
+    """Forty photos straight down, in strips there and back, by a gimbal that is not exact."""
+    poses = []
+    for strip in range(5):
+        for i in range(8):
+            x = 15.0 * (i if strip % 2 == 0 else 7 - i)
+            place = np.array([x, 25.0 * strip, 50.0])
+            target = np.array([*(place[:2] + rng.normal(0, 1, 2)), 0.0])
+            roll = np.pi * (strip % 2) + rng.normal(0, 0.05)
+            poses.append(look_at(place, target, roll=roll))
+    return np.stack(poses)
+
+
+def test_heights_that_scatter_over_70_m_do_not_tilt_the_ground() -> None:
+    rng = np.random.default_rng(11)
+    world = flight(rng)
+    enu = camera_centre(world) + rng.normal(0, [0.5, 0.5, 0.0], (40, 3))
+    enu[:, 2] += rng.uniform(-35, 35, 40)
+    found = align_to_gps(WORLD_FROM_MODEL.inverse().apply_to_pose(world), enu)
+    assert found is not None and found.by_horizon
+    error = found.enu_from_model @ WORLD_FROM_MODEL.inverse()
+    assert np.degrees(np.arccos(error.rotation[2, 2])) < 2.0
+    assert error.scale == pytest.approx(1.0, abs=0.01)
+
+
+def test_precise_heights_level_the_model_whatever_its_photos_look_at() -> None:
+    rng = np.random.default_rng(12)
+    world = flight(rng)
+    world[:, :3, :3] = Sim3(1, _turn(8.0), np.zeros(3)).rotation @ world[:, :3, :3]
+    enu = camera_centre(world) + rng.normal(0, [0.5, 0.5, 1.0], (40, 3))
+    found = align_to_gps(world, enu)
+    assert found is not None and not found.by_horizon
+    assert np.degrees(np.arccos(found.enu_from_model.rotation[2, 2])) < 0.5
+
+
+def _turn(degrees: float) -> Array:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def as_model(make_scene_folder: Callable[..., Path]) -> tuple[Any, dict[str, Array]]:
+    """A model of 40 images, and their centres a hundred times as large."""
+    names = [f"{i:02d}.png" for i in range(40)]
+    folder = make_scene_folder(dict.fromkeys(names, 0), tests=[])
+    model = read_reconstruction(folder / "sparse" / "0")
+    return model, {
+        str(i.name): 100 * np.asarray(i.projection_center()) for i in model.images.values()
+    }
+
+
+def test_positions_with_rtk_count_before_the_others(make_scene_folder: Callable[..., Path]) -> None:
+    model, centres = as_model(make_scene_folder)
+    rng = np.random.default_rng(13)
+    names = sorted(centres)
+    fixed = set(names[::2])
+    enu = {n: (centres[n] + rng.normal(0, 0.02 if n in fixed else 20.0, 3)).tolist() for n in names}
+    sigma = {n: [0.02, 0.02, 0.03] if n in fixed else [5.0, 5.0, 10.0] for n in names}
+    moved, used = to_gps_frame(model, Priors(enu, sigma), [])
+    assert moved and set(used.enu) <= fixed and len(used.enu) > 15
+    for image in model.images.values():
+        np.testing.assert_allclose(image.projection_center(), centres[str(image.name)], atol=0.1)
+
+
+def test_a_scale_known_to_nine_percent_is_no_metre(make_scene_folder: Callable[..., Path]) -> None:
+    model, centres = as_model(make_scene_folder)
+    rng = np.random.default_rng(14)
+    spread = float(np.sqrt(np.stack(list(centres.values())).var(axis=0).sum()))
+    noise = 0.088 * spread * np.sqrt(40 / 3)
+    enu = {n: (c + rng.normal(0, noise, 3)).tolist() for n, c in centres.items()}
+    remarks: list[str] = []
+    moved, _ = to_gps_frame(model, Priors(enu, dict.fromkeys(enu, [5.0] * 3)), remarks)
+    assert not moved
+    assert any("not accurate enough for metres" in r for r in remarks)

@@ -237,3 +237,28 @@ def test_page_fits_a_phone(page: str, tmp_path: Path) -> None:
     found = re.search(r'data-wide="(\d+)"', result.stdout)
     assert found is not None, result.stderr[-500:]
     assert int(found[1]) <= 360
+
+
+def test_rings_of_gps_are_drawn_in_the_frame_of_gps_only(model: Registered) -> None:
+    assert any(c.gps is not None for c in camera_map(model).cameras)
+    bare = camera_map(replace(model, georeference=None))
+    assert all(c.gps is None for c in bare.cameras)
+
+
+def test_the_page_does_not_call_what_rises_misaligned(page: str) -> None:
+    text = " ".join(page.split())
+    assert "if they jump, the periods are misaligned" not in text
+    assert "What rises above the plane" in text and "shifts even where the alignment" in text
+
+
+def test_nobody_is_asked_to_click_on_sky(model: Registered) -> None:
+    photos = Photos(model)
+    found = spots(model, gather(model).seen, certify(model).pairs[0], 6, gaps=False)
+    ground = [s for s in found if photos.is_textured(s)]
+    assert ground  # the chequered ground
+    sky = replace(ground[0], xy_a=np.array([240.0, 20.0]))
+    with Image.open(Path(model.images_root) / model.names[sky.a]) as image:
+        blank = Image.new("RGB", image.size, (200, 215, 235))
+    assert photos.is_textured(ground[0])
+    photos._load = lambda index: np.asarray(blank)  # type: ignore[assignment]
+    assert not photos.is_textured(sky)

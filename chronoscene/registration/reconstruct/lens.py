@@ -1,0 +1,91 @@
+"""A full model of the lens where the photos can carry it. Worker process only.
+
+Photos are mapped with one coefficient of distortion, which few photos determine. What it leaves of
+the distortion of a lens bends a scene and shifts focal length and height, so a model of many photos
+is adjusted again with all coefficients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.features.camera_groups import MANY, MIN_PHOTOS
+from chronoscene.registration.photos.stated import contradicts
+from chronoscene.registration.reconstruct.candidates import copy_database
+from chronoscene.registration.reconstruct.focal import Focals, stated_focals
+from chronoscene.registration.reconstruct.mapping import Task, adjust, triangulate
+
+ROUNDS = 1  # Of bundle adjustment and triangulation
+
+MIN_GAIN = 0.02  # Share by which the median reprojection error must shrink
+
+
+def with_full_lens(
+    model: pycolmap.Reconstruction, task: Task, focals: Focals
+) -> pycolmap.Reconstruction:
+    """Adjust a model with all coefficients of cameras that took many photos.
+
+    Args:
+        model: Not changed.
+        task: Focal lengths that it holds are free from then on if the images determine them.
+        focals: What photos state.
+
+    Returns:
+        The adjusted model; the same one if no camera has enough photos, or nothing is gained.
+    """
+    cameras = [model.images[i].camera_id for i in model.reg_image_ids()]
+    many = [c for c in sorted(set(cameras)) if cameras.count(c) >= MIN_PHOTOS]
+    many = [c for c in many if model.cameras[c].model_name == "SIMPLE_RADIAL"]
+    if not many or task.short:
+        return model
+    before = _error(model)
+    free = replace(task, held=False)
+    for attempt in (free, task) if task.held else (free,):
+        found = _adjusted(model, attempt, many)
+        if _error(found) > (1 - MIN_GAIN) * before:
+            task.remarks.append("more coefficients of the lens gain nothing")
+            return model
+        stated = stated_focals(found, focals)
+        if attempt.held or not any(
+            contradicts(float(found.cameras[c].mean_focal_length()), *stated[c])
+            for c in many
+            if c in stated
+        ):
+            focal = ", ".join(f"{found.cameras[c].mean_focal_length():.0f}" for c in many)
+            task.remarks.append(
+                f"all coefficients of the lens: focal length {focal} px, median reprojection "
+                f"error {before:.3f} -> {_error(found):.3f} px"
+            )
+            task.held = attempt.held
+            return found
+    return model
+
+
+def _adjusted(
+    model: pycolmap.Reconstruction, task: Task, cameras: list[int]
+) -> pycolmap.Reconstruction:
+    database = task.database
+    found = pycolmap.Reconstruction(model)
+    full = {}
+    for camera_id in cameras:
+        f, x, y, k = found.cameras[camera_id].params
+        full[camera_id] = MANY, [f, f, x, y, k, 0.0, 0.0, 0.0]
+        found.cameras[camera_id].model = getattr(pycolmap.CameraModelId, MANY)
+        found.cameras[camera_id].params = full[camera_id][1]
+    task = replace(task, database=str(task.scratch / "lens.db"))
+    copy_database(database, Path(task.database), full)
+    for i in range(ROUNDS):
+        task.report("adjusting the lens", i, ROUNDS)
+        adjust(found, task)
+        found = triangulate(found, task, "lens")
+    adjust(found, task)
+    return found
+
+
+def _error(model: pycolmap.Reconstruction) -> float:
+    """Median reprojection error, pixels."""
+    return float(np.median([p.error for p in model.points3D.values()] or [np.inf]))
