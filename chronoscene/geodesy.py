@@ -143,9 +143,9 @@ def read_projected(place: str, text: str, *, metres: bool = False) -> ReferenceS
     system = read_reference_system(place, text, error=ConfigError)
     if not system.is_projected or (metres and system.unit != 1):
         raise ConfigError(
-            f"{place} {text}",
+            place,
             expected=f"a projected reference system{' in metres' * metres}, such as EPSG:32632",
-            found="one in feet" if system.is_projected else "one in degrees",
+            found=f"one in {'feet' if system.is_projected else 'degrees'} ({text})",
             todo="choose the UTM zone of the place, for example",
         )
     return system

@@ -13,13 +13,13 @@ from chronoscene.geodesy import ReferenceSystem, read_projected
 from chronoscene.io.processes import Report
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
+from chronoscene.registration.control.route import check_options, resect_photos
 from chronoscene.registration.features.correspondences import find_matches
 from chronoscene.registration.output import Inspection, inspect_registration
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import PhotoInputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.extension import add_period
-from chronoscene.registration.reconstruct.known_control import check_options, resect_photos
 from chronoscene.registration.report.coordinates import placed_model, write_coordinates
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, tie

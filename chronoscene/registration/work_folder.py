@@ -161,7 +161,7 @@ TASKS = {
     "separate": "chronoscene.registration.reconstruct.routes:separate",
     "frozen": "chronoscene.registration.reconstruct.routes:add_period",
     "triangulate": "chronoscene.registration.reconstruct.known_poses:triangulate_scene",
-    "resection": "chronoscene.registration.reconstruct.resection:resect",
+    "resection": "chronoscene.registration.control.resection:resect",
     "refine": "chronoscene.registration.reconstruct.routes:refine",
 }
 """``module:function`` of each task. It takes a dictionary and a `Report`, and returns JSON data."""

@@ -14,6 +14,12 @@ from typing import Literal
 import numpy as np
 
 from chronoscene.arrays import Array
+from chronoscene.registration.quality.left_out import (
+    contradicted,
+    errors_left_out,
+    not_fixed,
+    precision,
+)
 from chronoscene.registration.quality.metadata import Comparison, compare_with_metadata
 from chronoscene.registration.quality.metadata import objections as contradictions
 from chronoscene.registration.quality.verdict import Level, Objection, Threshold, check, worst_level
@@ -112,12 +118,12 @@ class Position:
     """Cameras against their GPS positions."""
     ground_pixel: float | None
     """Metres that a pixel covers, median over the surveyed points."""
-    left_out: Rmse | None = None
-    """Control points, each placed by an adjustment to which its coordinates are unknown."""
     scale_error: float | None = None
     """Relative standard deviation of the scale by GPS."""
     metadata: tuple[Comparison, ...] = ()
     """The model beside what its photos state."""
+    left_out: Rmse | None = None
+    """Control points, each placed by an adjustment to which its coordinates are unknown."""
 
     @property
     def todo(self) -> tuple[str, ...]:
@@ -149,13 +155,14 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     checks = [r for r in points if r.role == "check" or not controlled]
     used = [r for r in points if r.used]
     found, control, gps = _of_points(checks), _of_points(used), _against_gps(model)
-    left_out = _left_out(model)
+    without = errors_left_out(model)
+    left_out = _rmse(list(without), np.array([error for error, _ in without.values()]))
     pixels = [r.ground_pixel for r in points if r.ground_pixel is not None]
     pixel = float(np.median(pixels)) if pixels else None
     objections = [
         *_errors("check points", found, pixel),
         *_errors("control points", control, pixel),
-        *_contradicted(model),
+        *contradicted(model, POSITION_THRESHOLDS["left_out"]),
     ]
     objections += _rejected(
         [r for r in points if r.role == "control" and controlled and not r.used]
@@ -179,12 +186,12 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if model.resection is None or found is not None:
         objections += _unproven(found, control, gps)
     else:
-        objections += _open(model, pixel)
+        objections += not_fixed(model, POSITION_THRESHOLDS["horizontal"], pixel)
     objections.sort(key=lambda f: (f.level != "fail", f.check != "metadata"))
     level: Level | Literal["not checked"] = worst_level(f.level for f in objections)
     if found is None and control is None and gps is None and not objections:
         level = "not checked"
-    text = _words(level, objections, found, left_out, ties) + _precision(model)
+    text = _words(level, objections, found, left_out, ties) + precision(model)
     return Position(
         level,
         text,
@@ -193,63 +200,9 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
         control,
         gps,
         ground_pixel=pixel,
-        left_out=left_out,
         scale_error=scale_error,
         metadata=tuple(compared),
-    )
-
-
-def _errors_left_out(model: Registered) -> dict[str, tuple[Array, Array]]:
-    """Error of each control point without its coordinates, and its standard deviations."""
-    found = {} if model.resection is None else model.resection.left_out
-    return {k: (np.array(v[0]), np.array(v[1])) for k, v in found.items() if v is not None}
-
-
-def _left_out(model: Registered) -> Rmse | None:
-    errors = _errors_left_out(model)
-    return _rmse(list(errors), np.array([error for error, _ in errors.values()]))
-
-
-def _contradicted(model: Registered) -> Iterator[Objection]:
-    """Objections to control points that lie elsewhere than the others say."""
-    for name, (error, spread) in _errors_left_out(model).items():
-        ratio = float(np.abs(error / np.maximum(spread, 1e-9)).max())
-        distance, left = np.linalg.norm(error), np.linalg.norm(spread)
-        note = f" ({distance:.3g} m, of which the others leave {left:.2g} m open)"
-        place = f"control point {name}"
-        yield from check(POSITION_THRESHOLDS["left_out"], ratio, place, "left_out", note)
-
-
-def _open(model: Registered, pixel: float | None) -> Iterator[Objection]:
-    """An objection where the other points fix one only roughly, so that it proves nothing."""
-    limit = (pixel or 0.0) * (POSITION_THRESHOLDS["horizontal"].fail or 0.0)
-    errors = _errors_left_out(model)
-    spread = {name: float(np.linalg.norm(errors[name][1])) for name in errors}
-    for name in model.resection.left_out if model.resection is not None else ():
-        spread.setdefault(name, float("inf"))
-    worst = max(spread, key=lambda name: spread[name], default="")
-    if spread and spread[worst] > limit:
-        how = f"{spread[worst]:.2g} m" if errors.get(worst) is not None else "any distance"
-        yield Objection(
-            "doubtful", "independent", "control points",
-            f"the others leave {how} of {worst} open, where its coordinates are unknown",
-            "a point that the others do not fix cannot confirm them",
-            "mark more control points, spread over the photos, or set some aside as check points",
-        )  # fmt: skip
-
-
-def _precision(model: Registered) -> str:
-    """Standard deviations of the poses in words."""
-    if model.resection is None:
-        return ""
-    if not model.resection.deviations:
-        return " The control points do not fix all poses."
-    spreads = list(model.resection.deviations.values())
-    centre = max(float(np.linalg.norm(c)) for c, _ in spreads)
-    turn = max(max(angles) for _, angles in spreads)
-    return (
-        f" By the adjustment, every camera is known to {centre:.2g} m and {turn:.2g} degrees or "
-        "better (one standard deviation)."
+        left_out=left_out,
     )
 
 

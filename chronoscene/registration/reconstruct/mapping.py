@@ -144,7 +144,7 @@ def map_images(
         found.append((kind, certain, models))
         _note(task, f"mapping with {kind}", models, label)
     _, matches = verified_matches(certain.database)
-    kind, best, models = max(found, key=lambda f: support(f[2][0], matches) if f[2] else 0)
+    kind, best, models = max(found, key=lambda f: support(f[2][0], matches) if f[2] else -np.inf)
     if models:
         task.remarks.append(f"{kind}: chosen, as most matches agree with it")
         task.database, task.short = best.database, best.short

@@ -15,6 +15,7 @@ import numpy as np
 from chronoscene.errors import RegistrationError
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.control.adjustment import add_point, adjust_with_control, drop_bad
 from chronoscene.registration.features.database import verified_matches
 from chronoscene.registration.reconstruct.candidates import copy_database
 from chronoscene.registration.reconstruct.consistency import (
@@ -22,11 +23,6 @@ from chronoscene.registration.reconstruct.consistency import (
     agreement,
     deregister_misplaced,
     pair_agreements,
-)
-from chronoscene.registration.reconstruct.control_adjustment import (
-    add_point,
-    adjust_with_control,
-    drop_bad,
 )
 from chronoscene.registration.reconstruct.focal import hold_focals
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
@@ -233,8 +229,8 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (model and
     parameters by name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``control`` (see
-    `control_adjustment.adjust_with_control`), ``out``, ``scratch``, ``threads``, ``short`` and
-    ``held`` (of the model before).
+    `adjustment.adjust_with_control`), ``out``, ``scratch``, ``threads``, ``short`` and ``held`` (of
+    the model before).
     """
     task = Task.start(arguments, report)
     cameras: Mapping[str, tuple[str, list[float]]] = arguments["cameras"]
@@ -250,8 +246,10 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         for tie in arguments["ties"]:
             add_point(model, tie)
         if arguments["control"]:
-            adjust_with_control(model, arguments["control"], threads=task.threads)
-            drop_bad(model)
+            adjust_with_control(
+                model, arguments["control"], hold_focal=task.held, threads=task.threads
+            )
+            drop_bad(model, task.min_angle)
         else:
             adjust(model, task)
     counts = f"{len(arguments['ties'])} tie points and {len(arguments['control'])} control points"

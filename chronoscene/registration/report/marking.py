@@ -66,7 +66,7 @@ def marking_page(
         "depths": (1.0, 100.0) if found is None else _depths(found),
         "crs": points.crs.text if points is not None and points.crs is not None else "",
         "file": file,
-        "key": hashlib.sha256("\n".join([title, *names]).encode()).hexdigest()[:12],
+        "key": hashlib.sha256(repr((title, names, state)).encode()).hexdigest()[:12],
     }
     return render_page("marking/page", title=title, file=file, data=data)
 

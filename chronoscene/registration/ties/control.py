@@ -79,7 +79,7 @@ def _rms(errors: Array) -> float:
 def control_arguments(
     model: Registered, points: TiePoints, used: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Control for `control_adjustment.adjust_with_control`.
+    """Control for `adjustment.adjust_with_control`.
 
     Without a stated accuracy, a point counts as exact as the similarity fits all of these.
 

@@ -160,9 +160,12 @@ def test_unsaved_work_is_kept(browser: Any, page: Path) -> None:
     opened.mark((20, 30))
     opened.tab.goto("about:blank")
     opened.open(page)
-    assert "Unsaved work" in opened.tab.locator("#status").inner_text()
+    assert "marks of last time" in opened.tab.locator("#status").inner_text()
     found = opened.tab.evaluate("state.points[0].marks")
     np.testing.assert_allclose(found[NAMES[0]], (20, 30), atol=1)
+    opened.tab.keyboard.press("u")
+    opened.open(page)
+    assert "marks of last time" not in opened.tab.locator("#status").inner_text()
     opened.context.close()
 
 

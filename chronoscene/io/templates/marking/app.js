@@ -1,14 +1,15 @@
 const $ = id => document.getElementById(id), view = $("view"), lens = $("lens");
 const photos = DATA.photos, KEY = `chronoscene-marks-${DATA.key}`, LENS = 5, NEAR = 4;
-let state = DATA.state, saved = JSON.stringify(state), history = [], photo = 0, point = 0;
+const initial = JSON.stringify(DATA.state);
+let state = DATA.state, saved = initial, history = [], photo = 0, point = 0;
 let scale = 1, shift = [0, 0], cursor = null, images = new Map();
 // state.points: {name, role, world, sigma, marks: {photo name: [x, y]}}, pixels of the original.
 
 const kept = (() => { try { return localStorage.getItem(KEY); } catch { return null; } })();
-if (kept && kept !== saved) {
+if (kept && kept !== initial) {
   state = JSON.parse(kept);
-  say("Unsaved work of last time is back; Undo goes back to the file.");
-  history.push(saved);
+  say("The marks of last time are back; Undo goes back to the file.");
+  history.push(initial);
 }
 if (!state.points.length) addPoint();
 addEventListener("beforeunload", e => { if (JSON.stringify(state) !== saved) e.preventDefault(); });
@@ -21,7 +22,9 @@ function change(action) {
 }
 function keep() {
   const text = JSON.stringify(state);
-  try { localStorage.setItem(KEY, text); } catch { /* private mode: the warning remains */ }
+  try {
+    if (text === initial) localStorage.removeItem(KEY); else localStorage.setItem(KEY, text);
+  } catch { /* private mode: the warning remains */ }
   const marks = state.points.reduce((n, p) => n + Object.keys(p.marks).length, 0);
   say(`${state.points.length} points, ${marks} marks${text === saved ? "" : ", not saved"}`);
   show();

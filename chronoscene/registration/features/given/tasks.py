@@ -45,7 +45,8 @@ def extractor(
 
         def compute(path: Path, mask: Path | None) -> Features:
             keypoints, descriptors = extract(path, mask)
-            found = ImageFeatures(np.asarray(keypoints, np.float32), descriptors, None)
+            values = None if descriptors is None else np.asarray(descriptors)
+            found = ImageFeatures(np.asarray(keypoints, np.float32), values, None)
             place = f"{source.place}: {path.name}"
             return _stored(checked(place, found, image_size(path)))
 
@@ -88,9 +89,12 @@ def import_matches(arguments: Mapping[str, Any], report: Report) -> dict[str, An
     with pycolmap.Database.open(arguments["database"]) as opened:
         ids = {str(i.name): int(i.image_id) for i in opened.read_all_images()}
         counts = {n: int(opened.num_keypoints_for_image(i)) for n, i in ids.items()}
-        features = open_file(Source(**arguments["given"]["features"]))
-        photo = {v: k for k, v in match_names(source.place, sorted(ids), features.names).items()}
-        stored = open_file(source) if source.place != str(features.path) else features
+        first_source = Source(**arguments["given"]["features"])
+        photo = {name: name for name in ids}
+        if first_source.kind != "plug-in":
+            stored_names = open_file(first_source).names
+            photo = {v: k for k, v in match_names(source.place, sorted(ids), stored_names).items()}
+        stored = open_file(source)
         with pycolmap.DatabaseTransaction(opened):
             for first, second, rows in stored.matches(photo):
                 a, b = photo[first], photo[second]

@@ -10,11 +10,11 @@ import pytest
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.context import Options
+from chronoscene.registration.control.resection import poses_of
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.photos.known_cameras import known_groups, read_cameras
 from chronoscene.registration.pipeline import run
-from chronoscene.registration.reconstruct.resection import poses_of
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.reconstruct.control_adjustment import adjust_with_control
-from chronoscene.registration.reconstruct.precision import standard_deviations
+from chronoscene.registration.control.adjustment import adjust_with_control
+from chronoscene.registration.control.precision import standard_deviations
 
 SIDE = 40.0
 

@@ -36,6 +36,7 @@ def adjust_with_control(
     control: Sequence[Mapping[str, Any]],
     *,
     constant_cameras: bool = False,
+    hold_focal: bool = False,
     threads: int = 1,
 ) -> dict[str, int]:
     """Adjust all poses, points and, unless they are known, cameras; control fixes the frame.
@@ -45,6 +46,7 @@ def adjust_with_control(
         control: Each with ``name``, ``xyz``, ``sigma`` (null for a point whose coordinates take no
             part) and ``clicks``: name of the image, x, y.
         constant_cameras: Keep the calibrations.
+        hold_focal: Keep the focal lengths.
         threads: Of the solver.
 
     Returns:
@@ -62,6 +64,7 @@ def adjust_with_control(
             _add_coordinates(work, config, ids[str(point["name"])], point)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
+    options.refine_focal_length = not hold_focal
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_PIXELS
     options.ceres.solver_options.num_threads = threads
@@ -73,16 +76,16 @@ def adjust_with_control(
         image = work.images[image_id]
         frame = model.frames[model.images[image_id].frame_id]
         frame.set_cam_from_world(image.camera_id, image.cam_from_world())
-        model.cameras[image.camera_id].params = list(work.cameras[image.camera_id].params)
+        model.cameras[image.camera_id].params = work.cameras[image.camera_id].params.tolist()
     for point_id, point3D in model.points3D.items():
-        point3D.xyz = np.array(work.points3D[point_id].xyz)
+        point3D.xyz = work.points3D[point_id].xyz
     return ids
 
 
-def drop_bad(model: pycolmap.Reconstruction) -> None:
+def drop_bad(model: pycolmap.Reconstruction, min_angle: float = MIN_TRI_ANGLE) -> None:
     """Drop observations with a large error, and points with a small triangulation angle."""
     manager = pycolmap.ObservationManager(model)
-    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, MIN_TRI_ANGLE)
+    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, min_angle)
     manager.filter_observations_with_negative_depth()
     model.update_point_3d_errors()
 

@@ -19,13 +19,13 @@ from chronoscene.arrays import Array
 from chronoscene.errors import RegistrationError
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.control.adjustment import adjust_with_control, drop_bad
+from chronoscene.registration.control.precision import standard_deviations
 from chronoscene.registration.features.database import keypoints_of, verified_matches
 from chronoscene.registration.features.holdout import build_tracks
 from chronoscene.registration.reconstruct.consistency import Matches, agreeing_matches
-from chronoscene.registration.reconstruct.control_adjustment import adjust_with_control, drop_bad
 from chronoscene.registration.reconstruct.mapping import Task
 from chronoscene.registration.reconstruct.models import image_pose, known_images, set_pose
-from chronoscene.registration.reconstruct.precision import standard_deviations
 
 MAX_TRIPLES = 100  # Of control points, by which a photo is placed
 GROSS_PIXELS = 20.0  # A click that is further off does not count

@@ -30,7 +30,7 @@ def standard_deviations(
 
     Args:
         model: Adjusted.
-        control: See `control_adjustment.adjust_with_control`.
+        control: See `adjustment.adjust_with_control`.
         ids: Id of the point of each of them by name.
 
     Returns:
