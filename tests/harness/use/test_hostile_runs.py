@@ -39,7 +39,17 @@ READING = (
 )
 """Commands that read other files of runs."""
 OTHERS = {
-    *("all", "check-method", "convert", "doctor", "download", "edit", "new-method", "register"),
+    *(
+        "all",
+        "check-method",
+        "convert",
+        "doctor",
+        "download",
+        "edit",
+        "mark",
+        "new-method",
+        "register",
+    ),
     *("score-images", "split", "stats", "study", "synth", "triangulate", "tune", "undistort"),
     "validate",
 }

@@ -304,6 +304,8 @@ def test_several_scenes_are_refused(scene_folder):
 
 def test_the_command_ends_at_an_interruption_and_needs_no_torch(scene_folder):
     code = (
+        # A shell lets what it starts in the background ignore interruptions.
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import sys; from chronoscene.cli import main\n"
         "try: main()\n"
         "finally: print('torch' in sys.modules)"
