@@ -45,6 +45,7 @@ def jump(period: float) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize("color_and_opacity", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_smooth_motion_is_followed_between_periods_and_a_jump_is_not(
     color_and_opacity: bool,
 ) -> None:

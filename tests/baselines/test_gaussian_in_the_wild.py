@@ -279,7 +279,7 @@ def test_with_features_of_zero_a_model_is_its_static_part() -> None:
         np.testing.assert_allclose(colors.detach(), truth.detach(), atol=1e-5)
 
 
-@pytest.mark.parametrize("reference", ["image", "period"])
+@pytest.mark.parametrize("reference", ["image", pytest.param("period", marks=pytest.mark.slow)])
 def test_periods_differ_in_colour_alone_and_are_told_apart(reference: str) -> None:
     scene = two_periods()
     wild = train(scene, config(reference=reference), method_class=GaussianInTheWild)

@@ -44,7 +44,10 @@ def test_changes_are_drawn_over_what_is_below_them(cloud, tmp_path):
     np.testing.assert_allclose(right / above, 11 / 6, rtol=0.1)
 
 
-@pytest.mark.parametrize(("panels", "shape"), [(1, (1, 1)), (3, (1, 3)), (5, (2, 3)), (10, (3, 4))])
+@pytest.mark.parametrize(
+    ("panels", "shape"),
+    [(1, (1, 1)), (3, (1, 3)), (5, (2, 3)), pytest.param(10, (3, 4), marks=pytest.mark.slow)],
+)
 def test_panels_in_rows(cloud, tmp_path, panels, shape):
     panel = ChangePanel("", cloud.xyz, np.zeros(3000, int))
     draw_changes(cloud, [panel] * panels, tmp_path / "x.png")

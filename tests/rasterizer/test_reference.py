@@ -286,7 +286,7 @@ def test_order_of_the_input_does_not_matter(tools: SimpleNamespace) -> None:
     assert (here.info.radii[:, order] == there.info.radii).all()
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("antialiased", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_gradcheck(antialiased: bool, tools: SimpleNamespace) -> None:
     """Finite differences of every input, at pixels that no threshold is near to."""
     scene = tools.random_scene(7, 13, 11, seed=4)

@@ -123,6 +123,7 @@ def test_held_out_tracks_are_not_points_of_the_model(joint: tuple[Path, Register
     assert not held & used
 
 
+@pytest.mark.slow
 def test_features_of_a_database_are_used_and_named(
     joint: tuple[Path, Registered], captures: Path, truth: Scene, tmp_path: Path
 ) -> None:

@@ -45,6 +45,7 @@ def test_same_seed_same_bytes_with_one_thread(small: Path, tmp_path: Path) -> No
     assert not different and not failed and len(same) == len(names)
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_place(small: Path) -> None:
     from chronoscene.synth.city.plan import make_world
 
@@ -112,6 +113,7 @@ def test_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_progress_counts_to_the_end(tmp_path: Path) -> None:
     seen: list[tuple[int, int, str]] = []
     settings = preset("tiny", **SMALL, kind="street", periods=1)

@@ -212,7 +212,9 @@ def test_the_overview_has_metrics_and_size_side_by_side():
     ]
 
 
-@pytest.mark.parametrize(("scenes", "widths"), [(6, [16]), (12, [15, 14])])
+@pytest.mark.parametrize(
+    ("scenes", "widths"), [(6, [16]), pytest.param(12, [15, 14], marks=pytest.mark.slow)]
+)
 def test_many_scenes_are_folded(scenes, widths):
     runs = [
         record(method, scene=f"s{i}", ssim=(0.5, 0.5)) for i in range(scenes) for method in "ab"

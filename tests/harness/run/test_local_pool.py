@@ -116,6 +116,7 @@ run_bench(settings, print)
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
 )
+@pytest.mark.slow
 def test_all_runs_end_with_their_bench(number, scene_folder, tmp_path, monkeypatch):
     runs = tmp_path / "runs"
     monkeypatch.setenv("TOY_HOLD", f"0:{scene_folder}")  # for ever

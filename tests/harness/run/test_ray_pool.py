@@ -192,6 +192,7 @@ def test_runs_end_with_their_bench(number, on_ray, cluster, scene_folder, tmp_pa
         assert len(outcome.finished) == 2 and not list(tmp_path.rglob("*.partial"))
 
 
+@pytest.mark.slow
 def test_without_ray_or_a_cluster(scene_folder, tmp_path, monkeypatch):
     settings = bench_settings(
         (scene_folder,), ("toy_methods:MEAN",), tmp_path / "runs", ray="127.0.0.1:1"

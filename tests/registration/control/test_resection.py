@@ -92,6 +92,7 @@ def registered(few: Few, out: Path, points: Path) -> tuple[Registered, Inspectio
     return run(read_captures(few.captures), out, options, inspected=found.append), found[0]
 
 
+@pytest.mark.slow
 def test_few_photos_are_placed_and_say_how_well(few: Few, tmp_path: Path) -> None:
     model, found = registered(few, tmp_path / "out", few.points)
     assert set(model.names) == set(few.truth)

@@ -524,6 +524,7 @@ def matched(captures: Path, seed: int = 0) -> tuple[Matched, dict[str, list[str]
     return found, {entry["stage"]: entry["remarks"] for entry in context.stages.log}, ran
 
 
+@pytest.mark.slow
 def test_another_way_to_compute_features_does_the_stage_again(
     captures: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

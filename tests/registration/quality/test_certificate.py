@@ -118,6 +118,7 @@ ALIKE = (
     "by GPS, few matches",
     "few matches in one spot",
     "one step of a repetition",
+    "four periods, the last wrong",
 )
 """Cases that others resemble."""
 

@@ -108,6 +108,7 @@ def test_cameras_keep_their_distance(made, renderers) -> None:  # type: ignore[n
             assert depth[depth > 0].min() > 4.0
 
 
+@pytest.mark.slow
 def test_street_views_walk_between_the_houses() -> None:
     from chronoscene.synth.city.plan import make_world
     from chronoscene.synth.flights import plan_frames
