@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 import io
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from PIL import Image
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -22,6 +24,12 @@ def render_page(name: str, **values: Any) -> str:
         name: Template, such as ``viewer/page``.
         values: Variables of the template.
     """
+    return _environment().get_template(f"{name}.html.j2").render(**values)
+
+
+@cache
+def _environment() -> Environment:
+    """Return the one environment, which compiles a template once."""
     from jinja2 import Environment, FileSystemLoader
     from markupsafe import Markup
 
@@ -32,7 +40,7 @@ def render_page(name: str, **values: Any) -> str:
     environment.globals["asset"] = lambda file: Markup(
         (TEMPLATES / file).read_text(encoding="utf-8").removesuffix("\n")
     )
-    return environment.get_template(f"{name}.html.j2").render(**values)
+    return environment
 
 
 def data_uri(picture: Image.Image, *, form: str = "jpeg", quality: int = 82) -> str:

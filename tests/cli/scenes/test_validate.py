@@ -61,7 +61,15 @@ def test_warnings_count_when_strict(warned, options, expected):
     assert "1 warning" in text
 
 
-def test_folder_of_scenes(make_scene_folder, tmp_path):
+@pytest.fixture
+def one_process(monkeypatch):
+    """Scenes are checked here: starting processes takes longer than tiny scenes do."""
+    monkeypatch.setattr(
+        "chronoscene.cli.scenes.validate.map_parallel", lambda f, items, lost: map(f, items)
+    )
+
+
+def test_folder_of_scenes(make_scene_folder, tmp_path, one_process):
     for name in ("one", "two"):
         make_scene_folder(PERIODS, name=f"all/{name}", tests=["a3", "b3"])
     (tmp_path / "all/two/images/a0.png").unlink()
@@ -162,7 +170,7 @@ def test_fix_reports_what_it_did_and_what_remains(warned, tmp_path):
     assert (tmp_path / "fixed/sparse/0/test.txt").read_text() == "a3.png\nb3.png\n"
 
 
-def test_fix_of_several_scenes(make_scene_folder, tmp_path):
+def test_fix_of_several_scenes(make_scene_folder, tmp_path, one_process):
     for name in ("one", "two"):
         make_scene_folder(PERIODS, name=f"all/{name}", tests=["a3", "b3"])
     status, text = run(tmp_path / "all", "--fix", tmp_path / "fixed")
