@@ -1,9 +1,11 @@
 """Small scene folders for tests, made by COLMAP's own generator rather than by our writer."""
 
 import os
-from collections.abc import Callable, Generator, Mapping
+import shutil
+from collections.abc import Callable, Generator, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,3 +136,19 @@ def set_gsplat(monkeypatch: pytest.MonkeyPatch) -> Generator[Callable[[str | Non
 
     yield pretend
     runtime.gsplat_release.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium of the system, without a screen."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    program = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
+    if program is None:
+        pytest.skip("no Chromium here")
+    options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with api.sync_playwright() as playwright:
+        opened = playwright.chromium.launch(
+            executable_path=program, args=[*options, "--no-sandbox"]
+        )
+        yield opened
+        opened.close()

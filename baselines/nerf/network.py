@@ -8,11 +8,10 @@ from torch import Tensor
 from baselines.nerf.config import NerfConfig
 from chronoscene.fields.compositing import softplus, truncated_exp
 from chronoscene.fields.mlp import Groups, initial_layers
-from chronoscene.fields.network import FieldNetwork, named
+from chronoscene.fields.network import SHIFT, FieldNetwork, named
 
 TRANSIENT_OUTPUTS = 5
 """Density, colour and uncertainty of what is only in one photo."""
-_SHIFT = 1.0
 
 
 def time_size(config: NerfConfig) -> int:
@@ -42,7 +41,7 @@ class NerfNetwork(FieldNetwork):
         none = geometry[:, :0]
         features = self.mlp("density", self.encode(places), none, groups)
         activate = softplus if self.config.activation == "softplus" else truncated_exp
-        static = activate(features[:, 0] + _SHIFT)
+        static = activate(features[:, 0] + SHIFT)
         if geometry.shape[1] == 0:
             return static, features
         outputs = self.mlp("transient", features, geometry, groups)

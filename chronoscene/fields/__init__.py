@@ -4,7 +4,7 @@ What comes in is a `TrainingSet`; a subclass of `method.FieldMethod` says what t
 
 - `box`: the part of space that the sparse points span, and the contraction of the rest.
 - `occupancy`, `marching`: where rays are sampled, for each period.
-- `grid`, `frequencies`: codes of a place; `mlp`: small networks; `compositing`: sums along rays.
+- `grid`: the code of a place; `mlp`: small networks; `compositing`: sums along rays.
 - `rays`: pixels of all photos, and their rays. `network`: a field of these; `method`: training.
 
 `grid`, `mlp` and `compositing` have a definition in plain torch each, which a GPU runs, and kernels

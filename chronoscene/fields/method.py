@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.errors import CheckpointError, ShapeError
+from chronoscene.errors import ShapeError
 from chronoscene.fields.box import SceneBox, box_of, sensible_cells
 from chronoscene.fields.compositing import composite, visible
 from chronoscene.fields.config import FieldConfig
@@ -24,7 +24,14 @@ from chronoscene.fields.network import Codes, FieldNetwork
 from chronoscene.fields.occupancy import INTERVAL, Occupancy, start_occupancy
 from chronoscene.fields.rays import PixelPool, Rays, view_rays
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
-from chronoscene.training.checkpoint import DAMAGED, TRAINING, load_tensors, parts, save_tensors
+from chronoscene.training.checkpoint import (
+    TRAINING,
+    check_finite,
+    load_tensors,
+    misfit,
+    parts,
+    save_tensors,
+)
 from chronoscene.training.devices import to_device
 from chronoscene.training.optimizers.adam import Adam, all_finite
 from chronoscene.training.periods import period_weights
@@ -278,6 +285,7 @@ class FieldMethod(ABC):
     def load(self, folder: Path, *, device: str) -> None:
         """Read a model; what is stored with it takes precedence over the options given here."""
         tensors, self.meta = load_tensors(folder, device=device, method=self.name)
+        check_finite(folder, tensors)
         self.device = device
         try:
             self.config = type(self.config)(**self.meta["config"])
@@ -291,7 +299,7 @@ class FieldMethod(ABC):
             )
             self.network = self.network_class(self.config, tensors)
         except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            raise _misfit(folder, "tensors and a description that fit together", error) from error
+            raise misfit(folder, "tensors and a description that fit together", error) from error
         self.optimizer = None
 
     def save_training(self, folder: Path) -> None:
@@ -316,7 +324,7 @@ class FieldMethod(ABC):
                 self.occupancy.grids[i][:] = tensors[f"grid.{name}"].numpy()
         except (KeyError, RuntimeError, ShapeError, ValueError) as error:
             expected = f"a training that {self.name} {self.version} can go on with"
-            raise _misfit(folder, expected, error) from error
+            raise misfit(folder, expected, error) from error
 
     def size(self) -> MethodSize:
         """Count the numbers of the field, and all that are stored."""
@@ -327,9 +335,3 @@ class FieldMethod(ABC):
             len(params["table"]) if "table" in params else sum(p.numel() for p in params.values())
         )
         return MethodSize(count, sum(p.numel() for p in params.values()) + packed, unit)
-
-
-def _misfit(folder: Path, expected: str, error: Exception) -> CheckpointError:
-    return CheckpointError(
-        folder, expected=expected, found=f"{type(error).__name__}: {error}", todo=DAMAGED
-    )

@@ -17,7 +17,8 @@ from chronoscene.training.spherical_harmonics import basis
 DIRECTION_DEGREE = 3
 """Degree of the spherical harmonics of a direction: 16 numbers."""
 DIRECTION_SIZE = (DIRECTION_DEGREE + 1) ** 2
-_SHIFT = 1.0  # Logarithm of the density that a training starts with, per half edge of the cube
+SHIFT = 1.0
+"""Logarithm of the density that a training starts with, per half edge of the cube."""
 
 
 class Codes(NamedTuple):
@@ -91,7 +92,7 @@ class FieldNetwork:
     def density(self, places: Tensor, groups: Groups, geometry: Tensor) -> tuple[Tensor, Tensor]:
         """Return densities [N] and features [N, F] of places of some rays."""
         features = self.mlp("density", self.encode(places), geometry, groups)
-        return truncated_exp(features[:, 0] + _SHIFT), features
+        return truncated_exp(features[:, 0] + SHIFT), features
 
     def values(
         self, features: Tensor, places: Tensor, groups: Groups, directions: Tensor, color: Tensor

@@ -18,6 +18,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.io.documents import read_json_document
+from chronoscene.io.laz import write_laz
 from chronoscene.io.processes import Report
 from chronoscene.io.tables import csv_text
 from chronoscene.registration.output import CERTIFICATE
@@ -28,7 +29,6 @@ from chronoscene.survey.difference import measure_volumes, subtract
 from chronoscene.survey.distances import measure_distances
 from chronoscene.survey.figure import draw_difference
 from chronoscene.survey.grid import Grid, choose_grid, natural_resolution
-from chronoscene.survey.laz import write_points
 from chronoscene.survey.map_frame import MapFrame, map_frame
 from chronoscene.survey.rasters import read_polygons, write_raster
 from chronoscene.survey.surface import Surface, map_surface
@@ -80,7 +80,13 @@ class Survey:
             "period": np.full(len(cloud), period, np.uint16),
             "sigma": cloud.spread.astype(np.float32),
         }
-        write_points(self._path("points", period, "laz"), cloud, self.frame, numbers)
+        write_laz(
+            self._path("points", period, "laz"),
+            cloud.xyz,
+            cloud.rgb,
+            self.frame.crs,
+            dimensions=numbers,
+        )
         label = self.scene.periods[period].label
         return {"period": period, "label": label, "points": len(cloud)}
 
@@ -133,7 +139,7 @@ class Survey:
             "significant": significant.astype(np.uint8),
         }
         path = self.folder / "m3c2_{}_{}.laz".format(*pair)
-        write_points(path, found.cores, self.frame, numbers)
+        write_laz(path, found.cores.xyz, found.cores.rgb, self.frame.crs, dimensions=numbers)
         return {
             "m3c2": {
                 "core_points": len(significant),

@@ -110,6 +110,23 @@ def load_tensors(
         raise _refusal(path, "a safetensors file", str(error)) from error
 
 
+def check_finite(folder: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse models with numbers that are not finite: their pictures would be wrong silently."""
+    wrong = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
+    if wrong:
+        raise _refusal(
+            folder,
+            "finite numbers in all tensors of the model",
+            f"others in {', '.join(wrong)}",
+            f"{DAMAGED}, with lower learning rates if the training gave it",
+        )
+
+
+def misfit(folder: Path, expected: str, error: Exception, todo: str = DAMAGED) -> CheckpointError:
+    """Return the error for tensors and a description that do not go together."""
+    return _refusal(folder, expected, f"{type(error).__name__}: {error}", todo)
+
+
 def _read_meta(path: Path) -> dict[str, Any]:
     if not path.is_file():
         todo = "name the folder that a finished training wrote"

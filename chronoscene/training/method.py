@@ -7,7 +7,7 @@ trainer that changes its tensors.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -16,15 +16,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chronoscene.errors import CheckpointError, ShapeError
+from chronoscene.errors import ShapeError
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import (
-    DAMAGED,
     TRAINING,
     TrainingState,
+    check_finite,
     load_tensors,
+    misfit,
     save_tensors,
 )
 from chronoscene.training.config import SplattingConfig
@@ -188,18 +189,13 @@ class SplattingMethod(ABC):
     def load(self, folder: Path, *, device: str) -> None:
         """Read a model; what is stored with it takes precedence over the options given here."""
         tensors, self.meta = load_tensors(folder, device=device, method=self.name)
-        _check_finite(folder, tensors)
+        check_finite(folder, tensors)
         try:
             background = torch.tensor(self.meta["background"], dtype=torch.float32, device=device)
             self.background, self._exposure = background, tensors.pop(_EXPOSURE, None)
             self.restore(folder, tensors, device)
         except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            raise CheckpointError(
-                folder,
-                expected="tensors and a description that fit together",
-                found=f"{type(error).__name__}: {error}",
-                todo=DAMAGED,
-            ) from error
+            raise misfit(folder, "tensors and a description that fit together", error) from error
         self.trainer = None
 
     def save_training(self, folder: Path) -> None:
@@ -214,12 +210,9 @@ class SplattingMethod(ABC):
         try:
             self.trainer.load_state(TrainingState(tensors, meta["values"]))
         except (KeyError, RuntimeError, ShapeError) as error:
-            raise CheckpointError(
-                folder,
-                expected=f"a training that {self.name} {self.version} can go on with",
-                found=f"{type(error).__name__}: {error}",
-                todo="go on with the version of the software, and on the device, that began it",
-            ) from error
+            expected = f"a training that {self.name} {self.version} can go on with"
+            todo = "go on with the version of the software, and on the device, that began it"
+            raise misfit(folder, expected, error, todo) from error
 
     def size(self) -> MethodSize:
         """Count the primitives and all stored numbers."""
@@ -227,15 +220,3 @@ class SplattingMethod(ABC):
         count, parameters = len(tensors[self.primitive]), sum(t.numel() for t in tensors.values())
         unit = "anchors" if self.primitive == "anchors" else "Gaussians"
         return MethodSize(count, parameters, unit)
-
-
-def _check_finite(folder: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Refuse models with numbers that are not finite: their pictures would be wrong silently."""
-    wrong = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
-    if wrong:
-        raise CheckpointError(
-            folder,
-            expected="finite numbers in all tensors of the model",
-            found=f"others in {', '.join(wrong)}",
-            todo=f"{DAMAGED}, with lower learning rates if the training gave it",
-        )

@@ -1,4 +1,4 @@
-"""What defines NeuSC, by its card: geometry without time, steps, light after content."""
+"""NeuSC as its card defines it: geometry without time, steps, light after content."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from baselines.continual_nerf.method import Memory
+from chronoscene.errors import CheckpointError
 from chronoscene.fields.box import box_of, contract
 from chronoscene.fields.method import Drawn, FieldMethod
 from chronoscene.fields.occupancy import start_occupancy
@@ -77,6 +78,15 @@ def test_a_step_that_is_not_finite_changes_nothing(tmp_path: Path) -> None:
     assert report.skipped == "not finite"
     assert "loss" in report.not_finite
     assert saved(method, tmp_path / "after") == before
+
+
+def test_a_model_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    method = begun("clnerf", make_training_set(1))
+    with torch.no_grad():
+        method.network.params["color.0"][0, 0] = float("nan")
+    method.save(tmp_path)
+    with pytest.raises(CheckpointError, match=r"finite numbers .* others in color\.0"):
+        type(method)(method.config).load(tmp_path, device="cpu")
 
 
 def test_masked_photos_alone_make_a_step_empty() -> None:
@@ -206,7 +216,7 @@ def test_a_far_place_is_rendered_behind_the_box() -> None:
 
 
 def test_a_photo_of_transient_things_alone_is_not_rendered() -> None:
-    """Of NeRF-W: rendered views have no transient density, whatever the head says."""
+    """Rendered views of NeRF-W have no transient density, whatever the head says."""
     method = begun("nerf-w", make_training_set(1))
     view = make_training_set(1).views[0]
     before = method.render(view, 0.0).rgb

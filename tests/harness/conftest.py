@@ -219,19 +219,3 @@ def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
             )
             finished += run_bench(settings, lambda line: None).finished
     return {read_run(folder).method: folder for folder in finished}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium of the system, without a screen."""
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    program = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
-    if program is None:
-        pytest.skip("no Chromium here")
-    options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with api.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(
-            executable_path=program, args=[*options, "--no-sandbox"]
-        )
-        yield opened
-        opened.close()

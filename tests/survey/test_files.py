@@ -9,9 +9,8 @@ import pytest
 import rasterio
 
 from chronoscene.errors import ConfigError
-from chronoscene.survey.cloud import PointCloud
+from chronoscene.io.laz import write_laz
 from chronoscene.survey.grid import Grid
-from chronoscene.survey.laz import write_points
 from chronoscene.survey.map_frame import LOCAL, MapFrame
 from chronoscene.survey.rasters import NODATA, read_polygons, write_raster
 
@@ -52,9 +51,8 @@ def test_a_cloud(tmp_path, frame):
     rng = np.random.default_rng(0)
     xyz = rng.uniform(-50, 50, (500, 3)) + np.array([680_000, 5_152_000, 300])
     rgb = rng.integers(0, 256, (500, 3), dtype=np.uint8)
-    cloud = PointCloud(xyz, rgb, xyz, np.full(500, np.nan))
     numbers = {"period": np.full(500, 2, np.uint16), "sigma": rng.random(500, np.float32)}
-    write_points(tmp_path / "a.laz", cloud, frame, numbers)
+    write_laz(tmp_path / "a.laz", xyz, rgb, frame.crs, dimensions=numbers)
     read = laspy.read(tmp_path / "a.laz")
     assert read.header.are_points_compressed and read.header.point_format.id == 7
     np.testing.assert_allclose(read.xyz, xyz, atol=0.00051)
@@ -67,10 +65,9 @@ def test_a_cloud(tmp_path, frame):
 
 
 def test_a_cloud_without_points(tmp_path):
-    nothing = PointCloud(
-        np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3)), np.zeros(0)
-    )
-    write_points(tmp_path / "a.laz", nothing, HERE, {"period": np.zeros(0, np.uint16)})
+    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    numbers = {"period": np.zeros(0, np.uint16)}
+    write_laz(tmp_path / "a.laz", xyz, rgb, HERE.crs, dimensions=numbers)
     assert len(laspy.read(tmp_path / "a.laz")) == 0
 
 

@@ -14,13 +14,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.reconstruct.mapping import (
-    FUNCTION_TOLERANCE,
-    LOSS_PIXELS,
-    MAX_ITERATIONS,
-    MAX_REPROJECTION_ERROR,
-    MIN_TRI_ANGLE,
-)
+from chronoscene.registration.reconstruct.mapping import MAX_ITERATIONS, adjustment_options
 
 DISTANCE = 1e5  # Between a point and the cameras that stand for its coordinates, world units
 NOTHING = 1e-4  # Weight of east seen from the south: it is seen from above already
@@ -62,14 +56,8 @@ def adjust_with_control(
     for point in control:
         if point["sigma"] is not None:
             _add_coordinates(work, config, ids[str(point["name"])], point)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = not hold_focal
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = LOSS_PIXELS
-    options.ceres.solver_options.num_threads = threads
+    options = adjustment_options(threads, hold_focal=hold_focal)
     options.ceres.solver_options.max_num_iterations = 2 * MAX_ITERATIONS
-    options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, work)
     adjuster.solve()
     for image_id in model.reg_image_ids():
@@ -80,14 +68,6 @@ def adjust_with_control(
     for point_id, point3D in model.points3D.items():
         point3D.xyz = work.points3D[point_id].xyz
     return ids
-
-
-def drop_bad(model: pycolmap.Reconstruction, min_angle: float = MIN_TRI_ANGLE) -> None:
-    """Drop observations with a large error, and points with a small triangulation angle."""
-    manager = pycolmap.ObservationManager(model)
-    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, min_angle)
-    manager.filter_observations_with_negative_depth()
-    model.update_point_3d_errors()
 
 
 def add_point(model: pycolmap.Reconstruction, point: Mapping[str, Any]) -> int:

@@ -19,13 +19,14 @@ from chronoscene.arrays import Array
 from chronoscene.errors import RegistrationError
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.control.adjustment import adjust_with_control, drop_bad
+from chronoscene.registration.control.adjustment import adjust_with_control
 from chronoscene.registration.control.precision import standard_deviations
 from chronoscene.registration.features.database import keypoints_of, verified_matches
 from chronoscene.registration.features.holdout import build_tracks
 from chronoscene.registration.reconstruct.consistency import Matches, agreeing_matches
-from chronoscene.registration.reconstruct.mapping import Task
+from chronoscene.registration.reconstruct.mapping import Task, drop_bad
 from chronoscene.registration.reconstruct.models import image_pose, known_images, set_pose
+from chronoscene.scene.tracks import intersect_rays
 
 MAX_TRIPLES = 100  # Of control points, by which a photo is placed
 GROSS_PIXELS = 20.0  # A click that is further off does not count
@@ -237,12 +238,11 @@ def _intersect(
     rays = list(_rays(model, clicks))
     if len(rays) < 2:
         return None
-    projectors = [np.eye(3) - np.outer(d, d) for _, d in rays]
-    whole = np.sum(projectors, axis=0)
-    if np.linalg.eigvalsh(whole)[0] < 1e-4:  # half a degree between two rays
-        return None if far is None else rays[0][0] + far * rays[0][1]
-    ends = [p @ centre for p, (centre, _) in zip(projectors, rays, strict=True)]
-    return np.asarray(np.linalg.solve(whole, np.sum(ends, axis=0)))
+    centres, directions = (np.array(part) for part in zip(*rays, strict=True))
+    (place,), (parallax,) = intersect_rays(directions, centres, np.zeros(1, np.int64))
+    if len(rays) * parallax < 1e-4:  # half a degree between two rays
+        return None if far is None else np.asarray(centres[0] + far * directions[0])
+    return np.asarray(place)
 
 
 def _without(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,38 @@ def quiet() -> None:
     """Silence COLMAP's progress messages, and seed its random numbers."""
     pycolmap.logging.minloglevel = 2
     pycolmap.set_random_seed(SEED)
+
+
+def copy_database(source: Path, target: Path) -> None:
+    """Copy a database, including what is still in its journal."""
+    import sqlite3
+
+    with sqlite3.connect(source) as a, sqlite3.connect(target) as b:
+        a.backup(b)
+    a.close()
+    b.close()
+    remove_journals(target)
+
+
+def remove_journals(database: Path) -> None:
+    """Remove journals that remain after the last connection is closed, or when the disk is full."""
+    for suffix in ("-wal", "-shm"):
+        Path(f"{database}{suffix}").unlink(missing_ok=True)
+
+
+def copy_with_cameras(
+    source: str, target: Path, cameras: Mapping[int, tuple[str, Sequence[float]]]
+) -> None:
+    """Copy a database, with other models and parameters of some cameras, by their ids."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    copy_database(Path(source), target)
+    with pycolmap.Database.open(target) as opened:
+        for camera_id, (name, params) in cameras.items():
+            camera = opened.read_camera(camera_id)
+            camera.model = getattr(pycolmap.CameraModelId, name)
+            camera.params = params
+            opened.update_camera(camera)
 
 
 def read_pairs(path: Path) -> list[tuple[str, str]]:

@@ -23,7 +23,13 @@ from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import replacing
-from chronoscene.registration.features.database import keypoints_of, quiet, verified_matches
+from chronoscene.registration.features.database import (
+    copy_database,
+    keypoints_of,
+    quiet,
+    remove_journals,
+    verified_matches,
+)
 from chronoscene.scene.tracks import seen_by_period
 
 MIN_LEFT = 16  # A pair of images keeps at least this many matches: sparse pairs stay useful
@@ -149,8 +155,8 @@ def _filtered_copy(source: Path, target: Path, tracks: Tracks, chosen: Ints) -> 
     held = np.zeros(int(tracks.track.max()) + 1 if len(tracks.track) else 0, bool)
     held[chosen] = True
     with replacing(target) as partial, ExitStack() as leaving:
-        leaving.callback(_remove_journals, partial)
-        _copy_database(source, partial)
+        leaving.callback(remove_journals, partial)
+        copy_database(source, partial)
         with pycolmap.Database.open(str(partial)) as opened:
             pair_ids, geometries = opened.read_two_view_geometries()
             pairs = [pycolmap.pair_id_to_image_pair(i) for i in pair_ids]
@@ -168,23 +174,6 @@ def _filtered_copy(source: Path, target: Path, tracks: Tracks, chosen: Ints) -> 
 
 def _first_column(geometry: pycolmap.TwoViewGeometry) -> Ints:
     return np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)[:, 0]
-
-
-def _copy_database(source: Path, target: Path) -> None:
-    """Copy a database, including what is still in its journal."""
-    import sqlite3
-
-    with sqlite3.connect(source) as a, sqlite3.connect(target) as b:
-        a.backup(b)
-    a.close()
-    b.close()
-    _remove_journals(target)
-
-
-def _remove_journals(database: Path) -> None:
-    """Remove journals that remain after the last connection is closed, or when the disk is full."""
-    for suffix in ("-wal", "-shm"):
-        Path(f"{database}{suffix}").unlink(missing_ok=True)
 
 
 def _write_held_out(

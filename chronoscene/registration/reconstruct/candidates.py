@@ -7,14 +7,14 @@ structure repeats, a model with wrong poses has the most. The matches decide.
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from chronoscene.arrays import Ints
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.features.database import copy_with_cameras
 from chronoscene.registration.reconstruct.consistency import Matches, misplaced, pair_agreements
 
 SHORT_ANGLE = 0.5  # Degrees between the rays of points of short tracks
@@ -47,7 +47,7 @@ def support(model: pycolmap.Reconstruction, matches: Matches) -> int:
 
 def without_weak_pairs(database: str, copy: Path, periods: Mapping[str, int]) -> int:
     """Copy a database without `weak_pairs`, and return their number."""
-    copy_database(database, copy)
+    copy_with_cameras(database, copy, {})
     with pycolmap.Database.open(str(copy)) as opened:
         period = {int(i.image_id): periods[str(i.name)] for i in opened.read_all_images()}
         pair_ids, geometries = opened.read_two_view_geometries()
@@ -59,21 +59,6 @@ def without_weak_pairs(database: str, copy: Path, periods: Mapping[str, int]) ->
         for a, b in weak:
             opened.delete_two_view_geometry(a, b)
     return len(weak)
-
-
-def copy_database(
-    database: str, copy: Path, cameras: Mapping[int, tuple[str, Sequence[float]]] | None = None
-) -> None:
-    """Copy a database that no process has open, with other models and parameters of cameras."""
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    pycolmap.Database.open(database).close()  # merges a journal
-    shutil.copyfile(database, copy)
-    with pycolmap.Database.open(str(copy)) as opened:
-        for camera_id, (name, params) in (cameras or {}).items():
-            camera = opened.read_camera(camera_id)
-            camera.model = getattr(pycolmap.CameraModelId, name)
-            camera.params = params
-            opened.update_camera(camera)
 
 
 def weak_pairs(matches: Matches, period: Mapping[int, int]) -> list[tuple[int, int]]:

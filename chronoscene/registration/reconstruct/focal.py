@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features.database import verified_matches
+from chronoscene.registration.features.database import copy_with_cameras, verified_matches
 from chronoscene.registration.photos.stated import contradicts
-from chronoscene.registration.reconstruct.candidates import copy_database
 from chronoscene.registration.reconstruct.consistency import agreement, pair_agreements
 from chronoscene.registration.reconstruct.mapping import Task
 
@@ -90,7 +89,7 @@ def _set_focals(task: Task, held: Task, focals: Focals) -> None:
                 params = np.array(camera.params)
                 params[list(camera.focal_length_idxs())] = focals[str(image.name)][0]
                 changed[int(image.camera_id)] = str(camera.model_name), params.tolist()
-    copy_database(task.database, Path(held.database), changed)
+    copy_with_cameras(task.database, Path(held.database), changed)
 
 
 def _cost(

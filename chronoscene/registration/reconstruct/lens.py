@@ -8,18 +8,15 @@ is adjusted again with all coefficients.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.camera_groups import MANY, MIN_PHOTOS
+from chronoscene.registration.features.database import copy_with_cameras
 from chronoscene.registration.photos.stated import contradicts
-from chronoscene.registration.reconstruct.candidates import copy_database
 from chronoscene.registration.reconstruct.focal import Focals, stated_focals
 from chronoscene.registration.reconstruct.mapping import Task, adjust, triangulate
-
-ROUNDS = 1  # Of bundle adjustment and triangulation
 
 MIN_GAIN = 0.02  # Share by which the median reprojection error must shrink
 
@@ -68,7 +65,6 @@ def with_full_lens(
 def _adjusted(
     model: pycolmap.Reconstruction, task: Task, cameras: list[int]
 ) -> pycolmap.Reconstruction:
-    database = task.database
     found = pycolmap.Reconstruction(model)
     full = {}
     for camera_id in cameras:
@@ -76,12 +72,12 @@ def _adjusted(
         full[camera_id] = MANY, [f, f, x, y, k, 0.0, 0.0, 0.0]
         found.cameras[camera_id].model = getattr(pycolmap.CameraModelId, MANY)
         found.cameras[camera_id].params = full[camera_id][1]
-    task = replace(task, database=str(task.scratch / "lens.db"))
-    copy_database(database, Path(task.database), full)
-    for i in range(ROUNDS):
-        task.report("adjusting the lens", i, ROUNDS)
-        adjust(found, task)
-        found = triangulate(found, task, "lens")
+    database = task.scratch / "lens.db"
+    copy_with_cameras(task.database, database, full)
+    task = replace(task, database=str(database))
+    task.report("adjusting the lens", 0, 1)
+    adjust(found, task)
+    found = triangulate(found, task, "lens")
     adjust(found, task)
     return found
 

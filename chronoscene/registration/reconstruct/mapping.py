@@ -299,14 +299,7 @@ def adjust(
     Returns:
         Why the solver stopped.
     """
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = LOSS_PIXELS
-    options.ceres.solver_options.num_threads = task.threads
-    options.refine_focal_length = not task.held
-    options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
-    options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
+    options = adjustment_options(task.threads, hold_focal=task.held)
     config = pycolmap.BundleAdjustmentConfig()
     ids = sorted(model.reg_image_ids())
     for image_id in ids:
@@ -321,12 +314,29 @@ def adjust(
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     solved = adjuster.solve()
-    # Drop observations with a large error, and points with a small triangulation angle.
+    drop_bad(model, task.min_angle)
+    return str(solved.termination_type.name)
+
+
+def adjustment_options(threads: int, *, hold_focal: bool) -> pycolmap.BundleAdjustmentOptions:
+    """Return options with a robust loss."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = not hold_focal
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS_PIXELS
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
+    options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
+    return options
+
+
+def drop_bad(model: pycolmap.Reconstruction, min_angle: float = MIN_TRI_ANGLE) -> None:
+    """Drop observations with a large error, and points with a small triangulation angle."""
     manager = pycolmap.ObservationManager(model)
-    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, task.min_angle)
+    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, min_angle)
     manager.filter_observations_with_negative_depth()
     model.update_point_3d_errors()
-    return str(solved.termination_type.name)
 
 
 def _with_priors(

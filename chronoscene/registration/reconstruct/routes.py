@@ -15,9 +15,8 @@ import numpy as np
 from chronoscene.errors import RegistrationError
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.control.adjustment import add_point, adjust_with_control, drop_bad
-from chronoscene.registration.features.database import verified_matches
-from chronoscene.registration.reconstruct.candidates import copy_database
+from chronoscene.registration.control.adjustment import add_point, adjust_with_control
+from chronoscene.registration.features.database import copy_with_cameras, verified_matches
 from chronoscene.registration.reconstruct.consistency import (
     Matches,
     agreement,
@@ -30,6 +29,7 @@ from chronoscene.registration.reconstruct.lens import with_full_lens
 from chronoscene.registration.reconstruct.mapping import (
     Task,
     adjust,
+    drop_bad,
     map_images,
     register_rest,
     triangulate,
@@ -236,8 +236,9 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     cameras: Mapping[str, tuple[str, list[float]]] = arguments["cameras"]
     images = known_images(task.database).images.values()
     found = {i.camera_id: cameras[str(i.name)] for i in images if str(i.name) in cameras}
-    copy_database(task.database, task.scratch / "refined.db", found)
-    task.database = str(task.scratch / "refined.db")
+    database = task.scratch / "refined.db"
+    copy_with_cameras(task.database, database, found)
+    task.database = str(database)
     model = known_images(task.database)
     set_poses(model, arguments["poses"])
     for i in range(2):

@@ -21,6 +21,7 @@ from plyfile import PlyData, PlyElement
 
 from chronoscene.arrays import Array
 from chronoscene.geodesy import Georeference, ReferenceSystem
+from chronoscene.io.laz import write_laz
 from chronoscene.io.staging import replacing, write_text_atomic
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import PointResidual
@@ -157,27 +158,8 @@ def _write_points(path: Path, model: Placed, frame: Georeference, output: Refere
     with replacing(path) as partial:
         data.write(str(partial))
     if find_spec("laspy") is not None and len(places):
-        _write_laz(path.with_name(POINTS_LAZ), places, model.colors, output)
-
-
-def _write_laz(
-    path: Path, places: Array, colors: NDArray[np.uint8], output: ReferenceSystem
-) -> None:
-    """Write points as compressed LAS 1.4."""
-    import laspy
-    from pyproj import CRS
-
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    header.scales = np.full(3, 0.1**DECIMALS)
-    header.offsets = np.floor(places.min(axis=0))
-    header.add_crs(CRS.from_user_input(output.text))
-    points = laspy.LasData(header)
-    points.xyz = places
-    points.red, points.green, points.blue = colors.astype(np.uint16).T * 257
-    data = io.BytesIO()
-    points.write(data, do_compress=True)
-    with replacing(path) as partial:
-        partial.write_bytes(data.getbuffer())
+        with replacing(path.with_name(POINTS_LAZ)) as partial:
+            write_laz(partial, places, model.colors, output.text, step=0.1**DECIMALS)
 
 
 def write_control(path: Path, points: Sequence[PointResidual]) -> None:

@@ -43,7 +43,7 @@ def test_a_full_disk_leaves_no_journals(tmp_path, monkeypatch):
             Path(f"{target}{suffix}").touch()
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(holdout, "_copy_database", full)
+    monkeypatch.setattr(holdout, "copy_database", full)
     nothing = np.zeros(0, np.int64)
     tracks = holdout.Tracks(nothing, nothing, nothing, {}, nothing)
     with pytest.raises(DiskFullError):

@@ -2,8 +2,6 @@
 
 import csv
 import itertools
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -73,18 +71,6 @@ def test_the_command_writes_a_page(captures: Path, tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "3 photos" in done.output
     assert (tmp_path / "p.html").stat().st_size > 10_000
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    program = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
-    if program is None:
-        pytest.skip("no Chromium here")
-    with api.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield opened
-        opened.close()
 
 
 class Opened:

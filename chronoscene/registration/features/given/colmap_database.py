@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from chronoscene.registration.features.given.image_features import ImageFeatures, check_shape, wrong
+from chronoscene.registration.features.given.image_features import ImageFeatures, check_size, wrong
 
 MAX_IMAGES = 2**31 - 1  # COLMAP's; the id of a pair is MAX_IMAGES * first + second
 TABLES = ("cameras", "images", "keypoints", "descriptors", "matches", "two_view_geometries")
@@ -96,7 +96,7 @@ class ColmapDatabase:
         place = f"{self.path}: {table}, {column} {key}"
         if not isinstance(rows, int) or not isinstance(columns, int) or min(rows, columns) < 0:
             raise wrong(place, "numbers of rows and columns", f"{rows!r} and {columns!r}")
-        check_shape(place, (rows, columns))
+        check_size(place, (rows, columns))
         size = rows * columns * np.dtype(dtype).itemsize
         if not isinstance(data, bytes) or len(data) != size:
             raise wrong(place, f"{size} bytes", "another number of them")

@@ -14,21 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.errors import ConfigError
-from chronoscene.registration.features.given.image_features import ImageFeatures, check_shape, wrong
+from chronoscene.checks import import_extra
+from chronoscene.registration.features.given.image_features import ImageFeatures, check_size, wrong
 
 
 class HlocFile:
     """One file, open for reading."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            import h5py
-        except ImportError as error:
-            raise ConfigError(
-                str(path), expected="the package h5py, to read it", found="no such package",
-                todo="pip install 'chronoscene[hloc]'",
-            ) from error  # fmt: skip
+        h5py = import_extra("h5py", "hloc", str(path))
         self.path = path
         try:
             self.file = h5py.File(path, "r")
@@ -87,7 +81,7 @@ class HlocFile:
         place = f"{self.path}: {name}"
         if item.dtype.kind not in "fiu" or item.is_virtual or item.external:
             raise wrong(place, "numbers in this file", f"{item.dtype}, or a link to another file")
-        check_shape(place, item.shape)
+        check_size(place, item.shape)
         try:
             return np.asarray(item[()])
         except (OSError, RuntimeError) as error:

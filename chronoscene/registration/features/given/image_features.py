@@ -76,7 +76,7 @@ def wrong(
     return RegistrationError(place, expected=expected, found=found, todo=todo)
 
 
-def check_shape(place: str, shape: tuple[int, ...]) -> None:
+def check_size(place: str, shape: tuple[int, ...]) -> None:
     """Refuse sizes that no photo has, before memory is taken for them."""
     if len(shape) > 2 or any(n > MAX_KEYPOINTS for n in shape) or np.prod(shape) > MAX_VALUES:
         raise wrong(place, "the features or matches of a photo", f"an array of shape {shape}")

@@ -1,0 +1,51 @@
+"""Point clouds as LAZ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def write_laz(
+    path: Path,
+    xyz: NDArray[np.float64],
+    rgb: NDArray[np.uint8],
+    crs: str,
+    *,
+    step: float = 0.001,
+    dimensions: Mapping[str, NDArray[Any]] | None = None,
+) -> None:
+    """Write points with colours as LAS 1.4, compressed; needs laspy.
+
+    Args:
+        path: The file.
+        xyz: Coordinates. [N, 3]
+        rgb: Colours. [N, 3]
+        crs: Their reference system, as PROJ reads it.
+        step: Distance of two coordinates of the file.
+        dimensions: Further numbers of the points by their names. [N] each
+    """
+    import laspy
+    from pyproj import CRS
+
+    more = dimensions or {}
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales = np.full(3, step)
+    header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
+    header.add_crs(CRS.from_user_input(crs))
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams(name, values.dtype) for name, values in more.items()]
+    )
+    points = laspy.LasData(header)
+    points.xyz = xyz
+    points.red, points.green, points.blue = rgb.astype(np.uint16).T * 257
+    for name, values in more.items():
+        points[name] = values
+    data = BytesIO()
+    points.write(data, do_compress=True)
+    path.write_bytes(data.getbuffer())
