@@ -5,6 +5,7 @@ import pytest
 from chronoscene.harness import contract
 from chronoscene.harness.contract import CHECKS, check_method
 from chronoscene.harness.train.checks import MethodError
+from chronoscene.kernels.runtime import available_threads
 
 
 @pytest.fixture
@@ -45,6 +46,16 @@ def test_a_method_that_looks_at_test_photos_is_found(problems, monkeypatch, tmp_
     ]
     monkeypatch.delenv("TOY_PEEK")
     assert problems("PEEKING", rule) == [None]
+
+
+def test_a_loss_that_threads_round_is_found(problems):
+    threads = [c for c in CHECKS if c.__name__.startswith("threads_change_nothing")]
+    if available_threads() < 2:
+        pytest.skip("needs two processors")
+    few, many = problems("TORCH_MEANS", *(c.__name__ for c in threads))
+    assert few is None
+    assert many.startswith("training with 60,000 points and 2 threads instead of 1: expected")
+    assert problems("MEAN", "threads_change_nothing_for_many_points") == [None]
 
 
 def test_gaussians_of_another_period_are_found(problems):

@@ -11,12 +11,17 @@ import pytest
 from chronoscene.harness.contract import CHECKS
 from chronoscene.harness.contract.subject import PAUSE, NotApplicableError, Subject, train_elsewhere
 from chronoscene.harness.contract.tiny_training import STEPS
-from chronoscene.harness.contract.training import equal_seeds_give_equal_bytes
+from chronoscene.harness.contract.training import (
+    equal_seeds_give_equal_bytes,
+    threads_change_nothing_for_many_points,
+)
 from chronoscene.methods import load_spec, method_names
 from chronoscene.training.photometric import _PhotometricLoss
 
 QUICK = [name for name in method_names() if not load_spec(name).mixes_views]
 """Radiance fields take long; ``tests/fields`` has what is quick of the rules."""
+
+SLOW_RULES = {threads_change_nothing_for_many_points}
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +38,11 @@ def subject(request, tmp_path_factory):
     return Subject(request.param, tmp_path_factory.mktemp(request.param))
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize(
+    "check",
+    [pytest.param(c, marks=pytest.mark.slow) if c in SLOW_RULES else c for c in CHECKS],
+    ids=[check.__name__ for check in CHECKS],
+)
 def test_the_contract(subject, check, request):
     if check is equal_seeds_give_equal_bytes and subject.name in QUICK:
         subject.elsewhere = request.getfixturevalue("elsewhere")

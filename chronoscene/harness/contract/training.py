@@ -21,6 +21,10 @@ from chronoscene.harness.train.loop import seed_everything
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import Method, TrainingSet, build_config, import_object
 
+MANY_POINTS = 60_000
+"""Enough for torch to split a sum over them among threads, which rounds half of such sums
+otherwise."""
+
 
 def training_lowers_the_loss(subject: Subject) -> None:
     """Training returns finite losses, and lowers them."""
@@ -90,9 +94,7 @@ def equal_seeds_give_equal_bytes(subject: Subject) -> None:
 
 def threads_change_nothing(subject: Subject) -> None:
     """One and two threads give equal bytes."""
-    available = set_threads(None)
-    if available < 2:
-        raise NotApplicableError("needs two processors")
+    available = at_least_two_threads()
     # The model of the subject was trained with all threads there are.
     _ = subject.model
     for threads in {1, 2} - {available}:
@@ -100,6 +102,41 @@ def threads_change_nothing(subject: Subject) -> None:
         place = f"training with {threads} of {available} threads"
         demand(reports == subject.reports, place, "equal losses")
         same_files(subject.save(method), subject.model, place, "equal models")
+
+
+def threads_change_nothing_for_many_points(subject: Subject) -> None:
+    """One and two threads give equal bytes with tens of thousands of points, too.
+
+    Torch splits a sum among threads only from some ten thousand numbers on.
+    """
+    at_least_two_threads()
+    data, results = with_many_points(subject.data), []
+    for threads in (1, 2):
+        method, reports = tiny_training.train(subject.spec, data, threads=threads, steps=6)
+        results.append((reports, subject.save(method)))
+    (reports, model), (others, other) = results
+    place = f"training with {MANY_POINTS:,} points and 2 threads instead of 1"
+    demand(others == reports, place, f"losses of {reports}", others)
+    same_files(other, model, place, "equal models")
+
+
+def at_least_two_threads() -> int:
+    """Return the number of threads there are, if a rule about them can be checked."""
+    available = set_threads(None)
+    if available < 2:
+        raise NotApplicableError("needs two processors")
+    return available
+
+
+def with_many_points(data: TrainingSet) -> TrainingSet:
+    """Return the set with each of its points many times, spread over the scene."""
+    copies = -(-MANY_POINTS // len(data.points))
+    spread = np.random.default_rng(0).normal(0, 0.1, (copies, *data.points.shape))
+    points = (data.points + spread).reshape(-1, 3)[:MANY_POINTS].astype(np.float32)
+    source = np.arange(MANY_POINTS) % len(data.points)
+    return dataclasses.replace(
+        data, points=points, colors=data.colors[source], point_periods=data.point_periods[source]
+    )
 
 
 def another_seed_gives_another_model(subject: Subject) -> None:
@@ -200,6 +237,7 @@ CHECKS = (
     views_are_learned_at_their_periods,
     equal_seeds_give_equal_bytes,
     threads_change_nothing,
+    threads_change_nothing_for_many_points,
     another_seed_gives_another_model,
     test_photos_change_nothing,
     the_training_set_is_left_alone,

@@ -1,4 +1,4 @@
-"""Methods small enough to predict by hand, found as ``toy_methods:NAME``. No torch."""
+"""Methods small enough to predict by hand, found as ``toy_methods:NAME``."""
 
 from __future__ import annotations
 
@@ -129,6 +129,17 @@ class Peeking(MeanColour):
         self.colors += sum(zlib.crc32(photo.read_bytes()) for photo in photos) % 1000 / 1e9
 
 
+class TorchMeans(MeanColour):
+    """Its loss has means over all points that torch splits among the threads."""
+
+    def step(self, index, progress):
+        import torch
+
+        points = torch.from_numpy(self.train.points)
+        means = [(points * factor).sin().mean().item() for factor in range(1, 6)]
+        return replace(super().step(index, progress), loss=1.0 + sum(means))
+
+
 class LosesColours(MeanColour):
     """Its Gaussians are those of no period."""
 
@@ -186,6 +197,7 @@ NOT_FINITE = replace(
 BAD_IMAGE = spec("bad-image", BadImage)
 FULL_DISK = spec("full-disk", FullDisk)
 PEEKING = spec("peeking", Peeking)
+TORCH_MEANS = spec("torch-means", TorchMeans)
 LOSES_COLOURS = spec("loses-colours", LosesColours)
 KILLED = spec("killed", Killed)
 ORPHANED = spec("orphaned", Orphaned)
