@@ -4,10 +4,12 @@ On a CPU, `devices.has_kernels` is told to say no: then everything but the raste
 runs. It is compared with the compiled code.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +19,12 @@ from rounding import raise_eps
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.contract import tiny_training
+from chronoscene.harness.contract.subject import PAUSE
 from chronoscene.harness.train import painted_balls
 from chronoscene.methods import (
     Method,
     MethodSpec,
+    StepReport,
     TrainingSet,
     import_object,
     load_spec,
@@ -47,6 +51,8 @@ class Compiled:
 
     spec: MethodSpec
     data: TrainingSet
+    trainings: dict[str, Training] = field(default_factory=dict)
+    """By device."""
 
     def method(self, device: str = "cpu") -> Method:
         """At the start of a training with as many options as all methods have."""
@@ -99,6 +105,38 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     return request.param
 
 
+@dataclass
+class Training:
+    """A training on a device, saved on its way."""
+
+    method: Method
+    reports: list[StepReport]
+    saved: Path
+    """Folder of the training after `PAUSE` steps."""
+
+    def resumed(self, compiled: Compiled, device: str) -> Method:
+        """Return a new method with the saved training."""
+        if not compiled.spec.resumable:
+            pytest.skip("the method cannot be resumed")
+        method = compiled.method(device)
+        method.load_training(self.saved)
+        return method
+
+
+@pytest.fixture
+def training(compiled: Compiled, device: str, tmp_path_factory: pytest.TempPathFactory) -> Training:
+    """Trained once for all tests of a method on a device."""
+    if device not in compiled.trainings:
+        method, saved = compiled.method(device), tmp_path_factory.mktemp("saved")
+        reports = []
+        for i in range(tiny_training.STEPS):
+            if i == PAUSE and compiled.spec.resumable:
+                method.save_training(saved)
+            reports.append(method.step(i, i / tiny_training.STEPS))
+        compiled.trainings[device] = Training(method, reports, saved)
+    return compiled.trainings[device]
+
+
 def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
 
@@ -120,12 +158,14 @@ def test_first_steps_are_those_of_the_compiled_code(
 
 
 def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
-    compiled: Compiled, device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    compiled: Compiled,
+    training: Training,
+    device: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Trained on the device, saved; loaded on a CPU with its kernels, saved; loaded again."""
-    method = compiled.method(device)
-    steps = tiny_training.STEPS
-    losses = [method.step(i, i / steps).loss for i in range(steps)]
+    method, losses = training.method, [report.loss for report in training.reports]
     assert np.isfinite(losses).all() and np.mean(losses[-15:]) < 0.9 * np.mean(losses[:5])
     folders = [tmp_path / name for name in ("there", "here")]
     for folder in folders:
@@ -147,18 +187,12 @@ def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
 
 
 def test_a_training_goes_on_where_it_was_saved(
-    compiled: Compiled, device: str, tmp_path: Path
+    compiled: Compiled, training: Training, device: str
 ) -> None:
-    if not compiled.spec.resumable:
-        pytest.skip("the method cannot be resumed")
-    method, resumed = compiled.method(device), compiled.method(device)
-    for i in range(63):
-        method.step(i, i / tiny_training.STEPS)
-    method.save_training(tmp_path)
-    resumed.load_training(tmp_path)
-    reports = [m.step(63, 63 / tiny_training.STEPS) for m in (method, resumed)]
-    assert reports[0].primitives == reports[1].primitives
-    assert reports[1].loss == pytest.approx(reports[0].loss, rel=LOSS_TOLERANCE[device])
+    resumed = training.resumed(compiled, device)
+    report = resumed.step(PAUSE, PAUSE / tiny_training.STEPS)
+    assert report.primitives == training.reports[PAUSE].primitives
+    assert report.loss == pytest.approx(training.reports[PAUSE].loss, rel=LOSS_TOLERANCE[device])
 
 
 def test_a_training_of_another_device_goes_on_or_is_refused(
@@ -194,16 +228,14 @@ def test_a_view_of_nothing_is_an_empty_step(compiled: Compiled, device: str) -> 
     np.testing.assert_array_equal(compiled.image(method), before)
 
 
+@pytest.mark.parametrize("device", ["cpu"], indirect=True)
 def test_a_step_asks_a_gpu_little_and_gets_no_table(
-    compiled: Compiled, monkeypatch: pytest.MonkeyPatch
+    compiled: Compiled, training: Training, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As asked on a CPU, except by what is of the CPU alone."""
-    without_kernels(monkeypatch)
-    method = compiled.method()
-    for i in range(63):  # the rounds that change the set of primitives are among them
-        method.step(i, i / tiny_training.STEPS)
+    method = training.resumed(compiled, device)
     found = count_questions(monkeypatch)
-    for i in (63, 64):
+    for i in (PAUSE, PAUSE + 1):
         found.clear()
         method.step(i, i / tiny_training.STEPS)
         assert sum(found.values()) <= QUESTIONS, found
