@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 from PIL import Image
 
@@ -63,6 +64,27 @@ def write_model(model: pycolmap.Reconstruction, folder: Path, form: str) -> None
     if form == "old":
         (folder / "rigs.bin").unlink()
         (folder / "frames.bin").unlink()
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Make a folder that costs seconds once for all processes of the tests; do not change it."""
+
+    def make(name: str, fill: Callable[[Path], object]) -> Path:
+        root = tmp_path_factory.getbasetemp()
+        if "PYTEST_XDIST_WORKER" in os.environ:
+            root = root.parent
+        folder = root / f"made-{name}"
+        with FileLock(f"{folder}.lock"):
+            if not folder.exists():
+                unfinished = root / f"unfinished-{name}"
+                shutil.rmtree(unfinished, ignore_errors=True)
+                unfinished.mkdir()
+                fill(unfinished)
+                unfinished.rename(folder)
+        return folder
+
+    return make
 
 
 @pytest.fixture

@@ -25,9 +25,9 @@ SLOW_RULES = {threads_change_nothing_for_many_points}
 
 
 @pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory):
+def elsewhere(made_once):
     """All quick methods in one process, most of whose time it takes to start."""
-    return train_elsewhere(QUICK, tmp_path_factory.mktemp("elsewhere"))
+    return made_once("elsewhere", lambda folder: train_elsewhere(QUICK, folder))
 
 
 @pytest.fixture(

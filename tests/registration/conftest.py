@@ -87,11 +87,11 @@ class Case:
 
 
 @pytest.fixture(scope="session")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def truth(made_once: Callable[..., Path]) -> Scene:
     """A small city at two dates."""
-    folder = tmp_path_factory.mktemp("generated") / "scene"
-    generate(folder, SETTINGS)
-    return read_scene(folder)
+    return read_scene(
+        made_once("city", lambda folder: generate(folder / "scene", SETTINGS)) / "scene"
+    )
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,10 +23,9 @@ class Made:
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    folder = tmp_path_factory.mktemp("synth") / "tiny"
+def made(made_once: Callable[..., Path]) -> Made:
     settings = preset("tiny", off_centre=True)
-    generate(folder, settings)
+    folder = made_once("synth", lambda folder: generate(folder / "tiny", settings)) / "tiny"
     return Made(folder, settings, scene_format.read(folder))
 
 
