@@ -75,8 +75,10 @@ def imports(name: str) -> set[str]:
     return {target for target in targets if target in MODULES and target != name}
 
 
-GRAPH = {name: imports(name) for name in MODULES if name != "chronoscene"}
-"""Without the root, which imports its public interface at the first use."""
+@pytest.fixture(scope="module")
+def graph() -> dict[str, set[str]]:
+    """Imports of each module but the root, which imports its public interface at the first use."""
+    return {name: imports(name) for name in MODULES if name != "chronoscene"}
 
 
 def package(name: str) -> str:
@@ -92,29 +94,33 @@ def layer(name: str) -> int:
     return heights[package(name)]
 
 
-PACKAGED = [name for name in MODULES if name != "chronoscene"]
+def test_imports_point_down(graph: dict[str, set[str]]) -> None:
+    upward = {
+        name: found
+        for name, targets in graph.items()
+        if (found := {t for t in others(name, targets) if layer(t) >= layer(name)})
+    }
+    assert not upward
 
 
-@pytest.mark.parametrize("name", PACKAGED)
-def test_imports_point_down(name: str) -> None:
-    others = {t for t in GRAPH[name] if t != "chronoscene" and package(t) != package(name)}
-    upward = {t for t in others if layer(t) >= layer(name)}
-    assert not upward, f"{name} imports {sorted(upward)}"
+def others(name: str, targets: set[str]) -> set[str]:
+    """Those of the modules that are in other packages than the first."""
+    return {t for t in targets - {"chronoscene"} if package(t) != package(name)}
 
 
-def test_no_circle() -> None:
+def test_no_circle(graph: dict[str, set[str]]) -> None:
     try:
-        TopologicalSorter(GRAPH).prepare()
+        TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
 
 
-def test_torch_side_is_for_methods() -> None:
+def test_torch_side_is_for_methods(graph: dict[str, set[str]]) -> None:
     users = {
         name: used
-        for name in PACKAGED
+        for name, targets in graph.items()
         if package(name) not in TORCH_SIDE | {"chronogs", "baselines"}
-        and (used := {t for t in GRAPH[name] - {"chronoscene"} if package(t) in TORCH_SIDE})
+        and (used := {t for t in targets - {"chronoscene"} if package(t) in TORCH_SIDE})
     }
     assert not users
 

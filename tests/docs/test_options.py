@@ -8,7 +8,7 @@ import click
 import pytest
 
 from chronoscene.cli import COMMANDS, cli
-from chronoscene.methods import installed_methods, load_spec, options_of
+from chronoscene.methods import MethodSpec, installed_methods, load_spec, options_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = subprocess.run(
@@ -17,33 +17,43 @@ PAGES = subprocess.run(
     text=True,
     check=True,
 ).stdout.splitlines()
-SPECS = {name: load_spec(name) for name in installed_methods()}
-OPTIONS = {option.name for spec in SPECS.values() for option in options_of(spec)}
-GROUP = click.Context(cli)
-COMMAND_OPTIONS = {
-    name: {option for p in cli.get_command(GROUP, name).params for option in p.opts}
-    for name in COMMANDS
-}
-PRESETS = {preset for spec in SPECS.values() for preset in spec.presets}
-
-
 MARKDOWN = [page for page in PAGES if page.endswith(".md")]
 
 
+@pytest.fixture(scope="module")
+def command_options() -> dict[str, set[str]]:
+    """Options by command."""
+    group = click.Context(cli)
+    return {
+        name: {option for p in cli.get_command(group, name).params for option in p.opts}
+        for name in COMMANDS
+    }
+
+
+@pytest.fixture(scope="module")
+def specs() -> list[MethodSpec]:
+    """Of the installed methods."""
+    return [load_spec(name) for name in installed_methods()]
+
+
 @pytest.mark.parametrize("page", MARKDOWN)
-def test_options_of_commands_exist(page: str) -> None:
+def test_options_of_commands_exist(page: str, command_options: dict[str, set[str]]) -> None:
     text = (ROOT / page).read_text(encoding="utf-8").replace("\\\n", " ")
     for command, rest in re.findall(r"chronoscene ([a-z-]+)( [^`\n#]*)?", text):
         if command in COMMANDS:
             named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest))
-            assert named - {"--help"} <= COMMAND_OPTIONS[command], command
+            assert named - {"--help"} <= command_options[command], command
 
 
 @pytest.mark.parametrize("page", MARKDOWN)
-def test_options_and_presets_exist(page: str) -> None:
+def test_options_and_presets_exist(page: str, specs: list[MethodSpec]) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     options = {name.rpartition(".")[2] for name in re.findall(r"--set\s+'?([\w.-]+)=", text)}
-    assert options - {"NAME", "METHOD.NAME", "key", "KEY"} <= OPTIONS
+    assert options - {"NAME", "METHOD.NAME", "key", "KEY"} <= {
+        option.name for spec in specs for option in options_of(spec)
+    }
     named = re.findall(r"--preset\s+([\w./-]+)", text)
     presets = {name.rstrip(".") for name in named if not name.endswith(".toml")}
-    assert presets - {"NAME", "TEXT", "demo"} <= PRESETS  # The demo scene is a preset of synth
+    assert presets - {"NAME", "TEXT", "demo"} <= {  # The demo scene is a preset of synth
+        preset for spec in specs for preset in spec.presets
+    }
