@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli import COMMANDS, cli
+from chronoscene.cli import SECTIONS, cli
 
 PAGE = Path(__file__).parent / "reference" / "commands.md"
 
 HEAD = """\
 # Commands
 
-The text of `--help` of all commands, by subject. `python docs/make_commands.py` writes this page
+The text of `--help` of all commands, by section. `python docs/make_commands.py` writes this page
 anew; a test compares it with the program.
 
 Exit status: 0 success; 1 the command found what it was asked to look for (a validator's error, a
@@ -21,36 +21,21 @@ broken rule of a method), or part of its work failed, as it reports; 2 wrong usa
 cannot be read; 130 after Ctrl-C. `python -m chronoscene` is the same as `chronoscene`.
 """
 
-SUBJECTS = {
-    "chronoscene.cli.scenes": "Scenes",
-    "chronoscene.cli.runs": "Runs",
-    "chronoscene.cli.report": "Reports on runs",
-    "chronoscene.cli.methods": "Methods",
-    "chronoscene.cli": "This machine",
-}
-"""Title of each package of commands, in the order of the page."""
-
 
 def commands_page() -> str:
     """Return the page in Markdown."""
     parts = [HEAD, _contents()]
-    for package, title in SUBJECTS.items():
+    for title, commands in SECTIONS.items():
         parts.append(f"## {title}\n")
-        parts += [_command(name) for name in _names(package)]
+        parts += [_command(name) for name in commands]
     return "\n".join(parts)
-
-
-def _names(package: str) -> list[str]:
-    """Commands whose module is in a package, sorted."""
-    modules = {name: target.partition(":")[0] for name, target in COMMANDS.items()}
-    return sorted(name for name in modules if modules[name].rpartition(".")[0] == package)
 
 
 def _contents() -> str:
     rows = []
-    for package, title in SUBJECTS.items():
+    for title, commands in SECTIONS.items():
         rows.append(f"- {title}:")
-        rows += [f"  [`{name}`](#chronoscene-{name})" for name in _names(package)]
+        rows += [f"  [`{name}`](#chronoscene-{name})" for name in commands]
     return "\n".join([*rows, ""])
 
 

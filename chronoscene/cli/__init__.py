@@ -13,42 +13,86 @@ from chronoscene.io.processes import stoppable
 from chronoscene.io.staging import disk_full
 from chronoscene.io.wording import printable_lines
 
+SECTIONS = {
+    "From photos to products": {
+        "all": ("runs.all:command", "Make a scene, a model, a page and products from photos.")
+    },
+    "Scenes": {
+        "register": ("scenes.register:command", "Register photos of several dates in one frame."),
+        "mark": ("scenes.mark:command", "Make a page to mark points in photos."),
+        "validate": ("scenes.validate:command", "Check scenes and report all problems."),
+        "stats": ("scenes.stats:command", "Print the contents of scenes, by period."),
+        "synth": ("scenes.synth:command", "Generate a city photographed at several dates."),
+        "download": ("scenes.download:command", "Download the scenes of a public dataset."),
+        "convert": ("scenes.convert:command", "Convert a scene to another format."),
+        "split": ("scenes.split:command", "Choose new test images of a scene."),
+        "edit": (
+            "scenes.edit:command",
+            "Drop images, periods or points; rename periods or images.",
+        ),
+        "triangulate": (
+            "scenes.triangulate:command",
+            "Triangulate sparse points at the poses of a scene.",
+        ),
+        "undistort": ("scenes.undistort:command", "Undistort the images of a scene."),
+    },
+    "Benchmarks": {
+        "bench": ("runs.bench:command", "Train, render and score methods on scenes."),
+        "study": ("runs.study:command", "Run variants of a method on scenes, for one table."),
+        "tune": ("runs.tune:command", "Search for options by scores on validation views."),
+        "score": ("report.results:score", "Score finished runs again and print what changed."),
+        "score-images": (
+            "runs.score_images:command",
+            "Score test views that another program rendered.",
+        ),
+        "verify": (
+            "report.verify:command",
+            "Compute scores again and compare them with stored ones.",
+        ),
+    },
+    "Results": {
+        "table": ("report.results:table", "Print the results of finished runs."),
+        "compare": ("report.compare:command", "Show where the methods of finished runs differ."),
+        "tradeoff": ("report.tradeoff:command", "Show what quality costs in finished runs."),
+        "leakage": ("runs.leakage:command", "Measure what leaks between the periods of a run."),
+        "submit": (
+            "report.leaderboard:submit_command",
+            "Add finished runs to the entries of the leaderboard.",
+        ),
+        "leaderboard": (
+            "report.leaderboard:leaderboard_command",
+            "Build the site of the leaderboard.",
+        ),
+    },
+    "Trained models": {
+        "view": ("runs.view:command", "View runs, a scene or a registration live in the browser."),
+        "page": ("runs.page:command", "Make a page to walk through finished runs of a scene."),
+        "render": ("runs.render:command", "Render a finished run from any camera."),
+        "changes": (
+            "runs.changes:command",
+            "Map what changes between the periods of a finished run.",
+        ),
+        "survey": ("runs.survey:command", "Make maps and differences of elevations."),
+        "export": ("runs.export:command", "Export periods of a finished run as Gaussians."),
+        "compress": ("runs.compress:command", "Compress the model of a finished run."),
+    },
+    "Methods and this machine": {
+        "methods": ("methods.methods:command", "List the installed methods, or describe one."),
+        "check-method": (
+            "methods.check_method:check",
+            "Check that a method keeps the rules for methods.",
+        ),
+        "new-method": ("methods.check_method:new", "Create the package of a new method."),
+        "doctor": ("doctor:command", "Report what works on this machine."),
+    },
+}
+"""Sections of the help: command name to ``module:attribute`` in this package, and a summary, which
+is the first sentence of the help of the command."""
+
 COMMANDS = {
-    "all": "chronoscene.cli.runs.all:command",
-    "bench": "chronoscene.cli.runs.bench:command",
-    "changes": "chronoscene.cli.runs.changes:command",
-    "check-method": "chronoscene.cli.methods.check_method:check",
-    "compare": "chronoscene.cli.report.compare:command",
-    "compress": "chronoscene.cli.runs.compress:command",
-    "convert": "chronoscene.cli.scenes.convert:command",
-    "doctor": "chronoscene.cli.doctor:command",
-    "download": "chronoscene.cli.scenes.download:command",
-    "edit": "chronoscene.cli.scenes.edit:command",
-    "export": "chronoscene.cli.runs.export:command",
-    "leakage": "chronoscene.cli.runs.leakage:command",
-    "leaderboard": "chronoscene.cli.report.leaderboard:leaderboard_command",
-    "mark": "chronoscene.cli.scenes.mark:command",
-    "methods": "chronoscene.cli.methods.methods:command",
-    "new-method": "chronoscene.cli.methods.check_method:new",
-    "page": "chronoscene.cli.runs.page:command",
-    "register": "chronoscene.cli.scenes.register:command",
-    "render": "chronoscene.cli.runs.render:command",
-    "score": "chronoscene.cli.report.results:score",
-    "score-images": "chronoscene.cli.runs.score_images:command",
-    "split": "chronoscene.cli.scenes.split:command",
-    "stats": "chronoscene.cli.scenes.stats:command",
-    "study": "chronoscene.cli.runs.study:command",
-    "submit": "chronoscene.cli.report.leaderboard:submit_command",
-    "survey": "chronoscene.cli.runs.survey:command",
-    "synth": "chronoscene.cli.scenes.synth:command",
-    "table": "chronoscene.cli.report.results:table",
-    "tradeoff": "chronoscene.cli.report.tradeoff:command",
-    "tune": "chronoscene.cli.runs.tune:command",
-    "triangulate": "chronoscene.cli.scenes.triangulate:command",
-    "undistort": "chronoscene.cli.scenes.undistort:command",
-    "validate": "chronoscene.cli.scenes.validate:command",
-    "verify": "chronoscene.cli.report.verify:command",
-    "view": "chronoscene.cli.runs.view:command",
+    name: f"{__name__}.{target}"
+    for commands in SECTIONS.values()
+    for name, (target, _) in commands.items()
 }
 """Command name to ``module:attribute``."""
 
@@ -72,6 +116,12 @@ class LazyGroup(click.Group):
         module, _, attribute = COMMANDS[cmd_name].partition(":")
         command: click.Command = getattr(importlib.import_module(module), attribute)
         return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands by section, without their modules."""
+        for title, commands in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, summary) for name, (_, summary) in commands.items()])
 
 
 @click.group(
