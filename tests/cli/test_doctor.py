@@ -24,8 +24,9 @@ def rows(text):
 
 
 @pytest.fixture
-def bare(monkeypatch, tmp_path):
+def bare(monkeypatch, tmp_path, set_gsplat):
     """A machine without anything that is optional."""
+    set_gsplat(None)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.delenv("CHRONOSCENE_LPIPS_WEIGHTS", raising=False)
     monkeypatch.setattr("chronoscene.metrics.lpips_weights.find_spec", lambda name: None)
