@@ -24,6 +24,17 @@ from chronoscene.metrics.lpips_weights import candidate_files, check_available
 CANNOT_RUN = 1  # Exit status if no method can be trained
 CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
 
+EXTRAS = {
+    "compress": "constriction",
+    "flip": "flip_evaluator",
+    "hloc": "h5py",
+    "ray": "ray",
+    "survey": "rasterio",
+    "tune": "optuna",
+    "view": "viser",
+}
+"""Extras that no other row is about, with a package of each."""
+
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
@@ -60,6 +71,7 @@ def command() -> None:
         _open3d(),
         _lpips(),
         _video(),
+        _extras(),
         Diagnosis("processors", "ok", f"{available_threads()} of {os.cpu_count()}"),
         Diagnosis("memory", "ok", in_words(machine_memory()[0])),
         Diagnosis("disk", "ok", f"{in_words(shutil.disk_usage(Path.cwd()).free)} free here"),
@@ -155,3 +167,12 @@ def _video() -> Diagnosis:
     if find_spec("av") is None:
         return Diagnosis("video", "missing", "not installed", "pip install av; MP4 files need it")
     return Diagnosis("video", "ok", f"av {version('av')}")
+
+
+def _extras() -> Diagnosis:
+    missing = [name for name, package in EXTRAS.items() if find_spec(package) is None]
+    there = ", ".join(name for name in EXTRAS if name not in missing) or "none"
+    if not missing:
+        return Diagnosis("extras", "ok", there)
+    todo = f"pip install 'chronoscene[{','.join(missing)}]'; single commands and options need them"
+    return Diagnosis("extras", "missing", f"{there}; not {', '.join(missing)}", todo)

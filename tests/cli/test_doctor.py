@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from importlib.machinery import ModuleSpec
+from importlib.metadata import metadata
 
 import pytest
 from click.testing import CliRunner
@@ -49,6 +50,7 @@ def test_bare_machine_trains_and_is_told_what_to_install(bare):
         "open3d",
         "LPIPS weights",
         "video",
+        "extras",
     }
     assert "compiled once and kept in" in found["kernels"][1]
     assert found["memory"][1].endswith("GB") and found["disk"][1].endswith("free here")
@@ -57,8 +59,14 @@ def test_bare_machine_trains_and_is_told_what_to_install(bare):
         "gsplat: pip install 'chronoscene[cuda]', or use the CPU",
         "open3d: pip install 'chronoscene[synth]'",
         "LPIPS weights: run chronoscene download lpips-weights",
+        "extras: pip install 'chronoscene[compress,flip,hloc,ray,survey,tune,view]'",
     ):
         assert f"\n{advice}" in result.stdout
+
+
+def test_every_extra_has_a_row():
+    known = metadata("chronoscene").get_all("Provides-Extra")
+    assert {*doctor.EXTRAS, "cuda", "dev", "lpips", "synth"} == set(known)
 
 
 def test_full_machine(bare, monkeypatch, set_gsplat):
@@ -74,6 +82,7 @@ def test_full_machine(bare, monkeypatch, set_gsplat):
     found = rows(run().stdout)
     assert found["CUDA"] == ["ok", "GPU 1, 80.0 GB"]
     assert found["gsplat"] == ["ok", "gsplat 1.5.3"]
+    assert found["extras"] == ["ok", "compress, flip, hloc, ray, survey, tune, view"]
     assert found["LPIPS weights"][1].endswith("vgg16-397923af.pth")
 
 
