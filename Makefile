@@ -15,7 +15,8 @@ READY := $(VENV)/.ready
 # then from PyTorch's own; where there is none (macOS), the plain package is the CPU build.
 TORCH := torch==2.13.0
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
-PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
+# Bytecode is compiled at the end, on all cores.
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile
 
 DEMO := demo
 # Tables and pages call a scene by the name of its folder.
@@ -74,6 +75,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(PIP) --constraint constraints.txt --editable '.[synth]' 2>/dev/null \
 		&& $(MAKE) --no-print-directory open3d-libraries \
 		|| echo "open3d cannot be had here: chronoscene synth and its tests need it" >&2
+	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # Some packages have templates
 	touch $@
 
 # The wheel of open3d leaves out a few libraries of the system, libusb first of all. Nothing but
