@@ -59,6 +59,8 @@ def _outputs(*tensors: Tensor) -> Outputs:
 class Job:
     """One decode, forward and back: arguments of the kernels, and the memory behind them.
 
+    To be used while torch records no gradients.
+
     Args:
         fixed: Anchors, period weights, camera centre, visible anchors, used offsets, block rows.
         tensors: What gets gradients: offsets, features, blocks, log scales, global features, and
@@ -68,9 +70,9 @@ class Job:
     def __init__(self, fixed: Sequence[Tensor], tensors: Sequence[Tensor]) -> None:
         self._shapes = [tensor.shape for tensor in tensors]
         self._period_weights = fixed[1].detach()
-        anchors, weights, centre, visible, used, rows = (_plain(tensor) for tensor in fixed)
+        anchors, weights, centre, visible, used, rows = (tensor.contiguous() for tensor in fixed)
         offsets, features, blocks, log_scales, global_features, *heads = (
-            _plain(tensor) for tensor in tensors
+            tensor.contiguous() for tensor in tensors
         )
         self.layout = make_layout(
             base=features.shape[1],
@@ -158,10 +160,6 @@ class Job:
         unpack_gradients(self.layout, partial, self.heads, *ends)
         out[4] = self._period_weights[:, None] * shared
         return out
-
-
-def _plain(tensor: Tensor) -> Tensor:
-    return tensor.detach().contiguous()
 
 
 def _heads(tensors: Sequence[Tensor]) -> tuple[Head, Head, Head]:

@@ -257,13 +257,14 @@ def adam_tensors_alone(addresses, starts, sizes, scalars):  # type: ignore[no-un
         _adam_of_block(addresses, starts, sizes, scalars, block)
 
 
+@torch.no_grad()
 def all_finite(tensors: Sequence[Tensor]) -> Tensor:
     """Return True if no number is nan or infinite; far cheaper than an update of the same size.
 
     Returns:
         A scalar on the device of the tensors. bool
     """
-    tensors = [tensor.detach() for tensor in tensors if tensor.numel()]
+    tensors = [tensor for tensor in tensors if tensor.numel()]
     if not tensors:
         return torch.tensor(True)
     if not devices.has_kernels(*tensors):

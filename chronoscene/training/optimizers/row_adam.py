@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.kernels.compilation import inner, kernel
-from chronoscene.kernels.memory import load_first, read, read_index, store_first, write_index
+from chronoscene.kernels.memory import (
+    load_first,
+    prefetch,
+    read,
+    read_index,
+    store_first,
+    write_index,
+)
 from chronoscene.kernels.vectors import LANES, select, splat, sqrt
 from chronoscene.training import devices
 from chronoscene.training.optimizers.adam import (
@@ -45,6 +52,7 @@ LOG_BETA2 = math.log(BETA2)
 WAY_PARTS = 3
 """Numbers for each gap: way over mean / root of square, and what is left of the two moments."""
 _LENGTH = 6  # Place of `_Rows.length` in a job
+AHEAD = 8  # Rows between the request for one and its use
 CHUNK = 256  # Rows that a task takes at a time
 ZERO = float32(0)
 
@@ -278,6 +286,17 @@ def _copy(table, row, way, eps, out, m):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _prefetch(table, rows, m):  # type: ignore[no-untyped-def]
+    """Ask for a later row: it may be far from those before."""
+    if m < rows.length:
+        at = read_index(rows.numbers, m) * table.columns
+        for c in range(0, table.columns, LANES):
+            prefetch(table.values, at + c)
+            prefetch(table.means, at + c)
+            prefetch(table.squares, at + c)
+
+
+@inner
 def _part_of(jobs, starts, task):  # type: ignore[no-untyped-def]
     """Return the number of the job that a task is of, the job, and the task's first and last row.
 
@@ -298,6 +317,7 @@ def _fetch(jobs, starts, eps):  # type: ignore[no-untyped-def]
         n, (table, rows, waits), first, stop = _part_of(jobs, starts, task)
         for m in range(first, stop):
             row = read_index(rows.numbers, m)
+            _prefetch(table, rows, m + AHEAD)
             way, _, _ = _wait_of(table, row, waits)
             _copy(table, row, way, eps[n], rows.copies, m)
 
@@ -332,6 +352,7 @@ def _update(jobs, starts, scalars):  # type: ignore[no-untyped-def]
         given = scalars[n, 0], scalars[n, 1], scalars[n, 2]
         for m in range(first, stop):
             row = read_index(rows.numbers, m)
+            _prefetch(table, rows, m + AHEAD)
             _, keep1, keep2 = _wait_of(table, row, waits)
             _step(table, rows, m, row, (keep1, keep2), given)
             write_index(table.stamps, row, waits.now + 1)
