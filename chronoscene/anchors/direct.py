@@ -1,4 +1,4 @@
-"""What a training step learns from a view, by the compiled kernels without autograd between them.
+"""Training on one view by the compiled kernels, without autograd between them.
 
 Values and gradients have the bits of the way through autograd, which defines them, and which
 `AnchorTrainer` takes wherever this one does not apply.
@@ -39,7 +39,7 @@ class DirectPass(NamedTuple):
     """These Gaussians. [L]"""
     info: RasterInfo
     global_gradient: Tensor
-    """Of the global features. [1, G]"""
+    """Gradient of the global features. [1, G]"""
 
 
 @torch.no_grad()
