@@ -3,6 +3,7 @@
     python -m benchmarks.training.step SCENE [--train 1500] [--anchors 31000] [--steps 200]
     python -m benchmarks.training.step SCENE --model RUN/checkpoint
     python -m benchmarks.training.step --generated 1200000 --size 1600 1200 --device cuda
+    python -m benchmarks.training.step --scaling 20000 100000 1000000 --size 1200 900 --steps 30
 
 The first two are of ChronoGS on a CPU: it trains on a scene until the model is of a realistic size,
 then every part of ordinary steps is timed, neither the rounds that grow and prune, nor the reading
@@ -13,10 +14,13 @@ look at the minimum.
 The parts are timed inside real steps; what torch's autograd and Python need between them is the
 line "rest".
 
-The last is of any method, on so many generated points: each becomes an anchor or a Gaussian. Steps
+The third is of any method, on so many generated points: each becomes an anchor or a Gaussian. Steps
 are timed as they are. Then once more by parts, with the host waiting for the GPU before and after
 each, which takes longer but says what the parts take. Then under torch's profiler, which says for
-how long the GPU does anything, what is copied, and how often the host waits.
+for how long the GPU does anything, what is copied, and how often the host waits.
+
+The last is of ChronoGS, 3DGS and 4DGS on such points, with 1 thread, 2, 4, .. and all that the
+machine has, in turn: each part's share that runs in parallel, by Amdahl's law.
 """
 
 from __future__ import annotations
@@ -43,12 +47,16 @@ import torch
 from baselines.deformation_4dgs import model as deformed_model
 from benchmarks.training.generated import PROGRESS, make, training_set
 from benchmarks.training.gpu_trace import Summary, summary
+from benchmarks.training.scaling import METHODS, measure_scaling, print_scaling
 from chronogs import SPEC
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronoscene.anchors.decode.function import Decode
+from chronoscene.anchors import direct
+from chronoscene.anchors.decode.function import Job
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.anchors.model import AnchorModel
+from chronoscene.anchors.optimizer import AnchorOptimizer
+from chronoscene.anchors.rounds import DensityControl
 from chronoscene.anchors.trainer import AnchorTrainer
 from chronoscene.formats import read_scene
 from chronoscene.gaussians import model as gaussian_model
@@ -64,27 +72,31 @@ from chronoscene.kernels.runtime import (
     set_threads,
 )
 from chronoscene.methods import method_names
-from chronoscene.rasterizer.cpu import Render
-from chronoscene.training import drawing, gradients, losses, photometric
+from chronoscene.rasterizer.cpu import DirectRender, Render
+from chronoscene.training import drawing, gradients, losses, photometric, spherical_harmonics
 from chronoscene.training.optimizers.adam import Adam, DenseTable
-from chronoscene.training.optimizers.row_adam import RowAdam
 
 Timed = tuple[str, Any, str]
 PARTS: tuple[Timed, ...] = (
     ("frustum culling", AnchorModel, "visible"),
-    ("decode", Decode, "forward"),
+    ("fetch anchors", AnchorOptimizer, "seen"),
+    ("decode", Job, "__init__"),
+    ("decode", Job, "forward"),
+    ("spherical harmonics", spherical_harmonics._Evaluate, "forward"),
+    ("rasterize", DirectRender, "__init__"),
     ("rasterize", Render, "forward"),
-    ("loss", photometric._PhotometricLoss, "forward"),
-    ("volume term", losses._MeanVolume, "forward"),
-    ("volume term, backward", losses._MeanVolume, "backward"),
-    ("loss, backward", photometric._PhotometricLoss, "backward"),
+    ("loss and its gradient", direct, "loss_and_gradient"),
+    ("loss and its gradient", photometric._PhotometricLoss, "forward"),
+    ("volume term", direct, "add_mean_volume"),
+    ("rasterize, backward", DirectRender, "backward"),
     ("rasterize, backward", Render, "backward"),
-    ("decode, backward", Decode, "backward"),
+    ("spherical harmonics, backward", spherical_harmonics._Evaluate, "backward"),
+    ("decode, backward", Job, "backward"),
     ("check of gradients", gradients, "all_finite"),
-    ("density statistics", DensityStatistics, "update"),
-    ("fetch anchors", RowAdam, "fetch"),
-    ("Adam, seen anchors", RowAdam, "step"),
-    ("Adam, all scales", DenseTable, "step"),
+    ("density statistics", DensityControl, "collect"),
+    ("density statistics", GradientStatistics, "add"),
+    ("Adam", AnchorOptimizer, "step"),
+    ("Adam", Adam, "step"),
 )
 """Functions that are timed: name, owner, function."""
 GPU_PARTS: tuple[Timed, ...] = (
@@ -100,7 +112,7 @@ GPU_PARTS: tuple[Timed, ...] = (
     ("check of gradients", gradients, "all_finite"),
     ("density statistics", DensityStatistics, "update"),
     ("density statistics", GradientStatistics, "add"),
-    ("Adam", DenseTable, "step"),
+    ("Adam", AnchorOptimizer, "step"),
     ("Adam", Adam, "step"),
 )
 """Functions that are timed on a GPU. A part within another counts for itself only."""
@@ -266,6 +278,21 @@ def time_generated(
     print(f"peak memory of the GPU {torch.cuda.max_memory_allocated() / 1e6:.0f} MB")
 
 
+def time_scaling(points: Sequence[int], size: tuple[int, int], preset: str, steps: int) -> None:
+    """Time steps of several methods and sizes with different numbers of threads."""
+    most = available_threads()
+    threads = sorted({min(2**i, most) for i in range(most.bit_length() + 1)})
+    print(f"{processor_name()}, {most} threads, {library_versions()}, commit {code_version()}")
+    names = tuple(dict.fromkeys(name for name, _, _ in PARTS))
+    for number in points:
+        for method in METHODS:
+            found = measure_scaling(
+                method, number, size, preset=preset, threads=threads, steps=steps, measure=measure
+            )
+            title = f"{method} {preset}, {number:,} points, {size[0]}x{size[1]}"
+            print_scaling(title, found, names)
+
+
 def gpu_name() -> str:
     """GPU, driver, and the CUDA that torch was built for."""
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
@@ -287,13 +314,17 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200, help="timed steps")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--generated", type=int, metavar="POINTS", help="instead of a scene")
+    parser.add_argument("--scaling", type=int, nargs="+", metavar="POINTS", help="instead of it")
     parser.add_argument("--method", default="chronogs", choices=method_names())
     parser.add_argument("--size", type=int, nargs=2, default=(800, 600), metavar=("W", "H"))
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     args = parser.parse_args()
-    if (args.scene is None) == (args.generated is None):
-        parser.error("name a scene, or --generated")
+    if sum(given is not None for given in (args.scene, args.generated, args.scaling)) != 1:
+        parser.error("name a scene, --generated or --scaling")
     keep_freed_memory()
+    if args.scaling:
+        time_scaling(args.scaling, tuple(args.size), args.preset, args.steps)
+        return
     if args.generated:
         check_device(args.device)
         sizes = args.generated, tuple(args.size)

@@ -214,17 +214,18 @@ class AnchorModel:
 
     def decode(self, period_weights: Tensor, centre: Tensor, visible: Tensor) -> Splats:
         """Decode the visible anchors; arguments as those of `DecodeInputs`."""
-        return decode(self._decode_inputs(period_weights, centre, visible))
+        return decode(self.decode_inputs(period_weights, centre, visible))
 
     def decode_active(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
     ) -> tuple[Splats, Tensor]:
         """Return `decode` without Gaussians that are switched off, and the places of the others."""
-        return decode_active(self._decode_inputs(period_weights, centre, visible))
+        return decode_active(self.decode_inputs(period_weights, centre, visible))
 
-    def _decode_inputs(
+    def decode_inputs(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
     ) -> DecodeInputs:
+        """Return what `decode` reads; arguments as `DecodeInputs`."""
         opacity, covariance, color = (self._kernel_head(name) for name in HEADS)
         used = self.used_offsets
         if used is None:

@@ -12,8 +12,13 @@ from chronoscene.anchors.blocks import own_blocks
 from chronoscene.anchors.density import AnchorRows
 from chronoscene.anchors.model import FIXED, PER_ANCHOR, TABLES, AnchorModel
 from chronoscene.training.checkpoint import parts
-from chronoscene.training.optimizers.adam import Adam, DenseTable
-from chronoscene.training.optimizers.row_adam import RowAdam, make_table
+from chronoscene.training.optimizers.adam import Adam, DenseTable, apply_updates
+from chronoscene.training.optimizers.row_adam import (
+    RowAdam,
+    fetch_together,
+    make_table,
+    step_together,
+)
 
 
 class AnchorOptimizer:
@@ -41,22 +46,36 @@ class AnchorOptimizer:
 
     def seen(self, visible: Tensor, row: int) -> AnchorModel:
         """Return the visible anchors with one of the features that vary: a model of one period."""
-        tables, model = self.tables, self.model
-        blocks = rows = model.block_rows[visible]
+        model = self.model
         if model.layout.period_dim:
-            blocks, rows = rows[:, row], own_blocks(len(visible), 1).to(rows)
+            blocks = model.block_rows[:, row].index_select(0, visible)
+            rows = own_blocks(len(visible), 1).to(blocks)
+        else:
+            rows = model.block_rows[visible]
+            blocks = rows.flatten()
+        wanted = dict.fromkeys(PER_ANCHOR, visible) | {"blocks": blocks}
+        fetched = self._fetch(wanted)
         return type(model)(
             self._seen_layout,
-            anchors=model.anchors[visible],
-            offsets=tables["offsets"].fetch(visible),
-            features=tables["features"].fetch(visible),
-            blocks=tables["blocks"].fetch(blocks.flatten()),
+            anchors=model.anchors.index_select(0, visible),
+            **fetched,
             block_rows=rows,
-            log_scales=tables["log_scales"].fetch(visible),
             global_features=model.global_features[row : row + 1],
             heads=model.heads,
             used_offsets=None if model.used_offsets is None else model.used_offsets[visible],
         )
+
+    def _fetch(self, wanted: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Fetch rows of each table, by name."""
+        found, lazy = {}, []
+        for name, rows in wanted.items():
+            table = self.tables[name]
+            if isinstance(table, RowAdam):
+                lazy.append((name, table, rows))
+            else:
+                found[name] = table.fetch(rows)
+        copies = fetch_together([(table, rows) for _, table, rows in lazy]) if lazy else []
+        return found | {name: copy for (name, _, _), copy in zip(lazy, copies, strict=True)}
 
     def gradients(self) -> dict[str, Tensor]:
         """Return all gradients that there are, by the names of their tensors."""
@@ -73,11 +92,17 @@ class AnchorOptimizer:
             rates: Learning rate of each tensor.
             resized: True if the rows of the anchors have changed since the backward pass.
         """
-        self.adam.step(rates)
+        updates, lazy = self.adam.updates(rates), []
         if not resized:
             for name, table in self.tables.items():
-                if name in rates:
-                    table.step(rates[name])
+                if name not in rates:
+                    continue
+                if isinstance(table, RowAdam):
+                    lazy.append((table, rates[name]))
+                else:
+                    updates += table.updates(rates[name])
+        step_together(lazy)
+        apply_updates(updates)
 
     def flush(self) -> None:
         """Bring the rows of all anchors up to date."""

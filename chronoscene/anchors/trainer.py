@@ -13,20 +13,32 @@ from dataclasses import KW_ONLY, dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
+from chronoscene.anchors.direct import learn_directly
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.anchors.optimizer import AnchorOptimizer
 from chronoscene.anchors.rounds import DensityControl, DrawnView
-from chronoscene.methods import StepReport, TrainingSet
+from chronoscene.methods import StepReport, TrainingSet, TrainingView
+from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.devices import to_device
-from chronoscene.training.drawing import camera_centre_tensor, draw_in_training
+from chronoscene.training.drawing import camera_centre_tensor, draw_in_training, step_background
 from chronoscene.training.exposure import Exposure
-from chronoscene.training.gradients import BackwardPass, collect_gradients, mask_tensor
+from chronoscene.training.gradients import (
+    BackwardPass,
+    collect_gradients,
+    judge_gradients,
+    mask_tensor,
+)
 from chronoscene.training.losses import mean_volume, training_loss
 from chronoscene.training.schedules import learning_rates
 from chronoscene.training.views import ViewSampler
+
+Learned = tuple[BackwardPass, Tensor, Tensor, RasterInfo]
+"""Outcome, places [L] and opacities [L] of the Gaussians that are switched on, and details of the
+rasterization."""
 
 
 @dataclass(eq=False)
@@ -85,15 +97,48 @@ class AnchorTrainer:
 
     def _learn(self, number: int, done: float) -> BackwardPass:
         """Draw a training view, and collect gradients and statistics."""
-        config, device = self.config, self.model.device
         view, row = self.train.views[number], int(self.feature_rows[number])
-        photo = to_device(self.train.load_image(number), device)
-        mask = mask_tensor(self.train, number, device)
+        photo = to_device(self.train.load_image(number), self.model.device)
+        mask = mask_tensor(self.train, number, self.model.device)
         visible = self.model.visible(view)
-        everything = torch.arange(len(visible), device=visible.device)
-        splats, positions = self.optimizer.seen(visible, row).decode_active(
-            self._one_period, camera_centre_tensor(view, device), everything
-        )
+        seen = self.optimizer.seen(visible, row)
+        plain = mask is None and not self.exposure.tables
+        learned = self._learn_directly(seen, view, row, photo) if plain else None
+        if learned is None:
+            learned = self._learn_by_autograd(seen, number, photo, mask)
+        result, *facts = learned
+        if result.skipped is None:
+            drawn = DrawnView(view, row, mask, visible, *facts)
+            self.density.collect(drawn, result.loss, done)
+        return result
+
+    def _decode_arguments(self, seen: AnchorModel, view: TrainingView) -> tuple[Tensor, ...]:
+        """Return period weights, camera centre and the numbers of all anchors."""
+        everything = torch.arange(len(seen), device=seen.device)
+        return self._one_period, camera_centre_tensor(view, seen.device), everything
+
+    def _learn_directly(
+        self, seen: AnchorModel, view: TrainingView, row: int, photo: Tensor
+    ) -> Learned | None:
+        """Learn from a view without autograd; None where that does not apply."""
+        with torch.no_grad():
+            inputs = seen.decode_inputs(*self._decode_arguments(seen, view))
+        number = self.sampler.drawn
+        background = step_background(self.background, self.config, seed=self.seed, number=number)
+        found = learn_directly(seen, inputs, view, photo, background, self.config)
+        if found is None:
+            return None
+        if (table := self.model.global_features).numel():
+            table.grad = torch.zeros_like(table)
+            table.grad[row] = found.global_gradient[0]
+        result = judge_gradients(found.loss, found.info, self.optimizer.gradients())
+        return result, found.positions, found.splats.opacities, found.info
+
+    def _learn_by_autograd(
+        self, seen: AnchorModel, number: int, photo: Tensor, mask: Tensor | None
+    ) -> Learned:
+        config, view = self.config, self.train.views[number]
+        splats, positions = seen.decode_active(*self._decode_arguments(seen, view))
         raster = draw_in_training(
             splats, view, self.background, config, seed=self.seed, number=self.sampler.drawn
         )
@@ -105,10 +150,7 @@ class AnchorTrainer:
         result = collect_gradients(
             loss, raster.info, lambda: self.optimizer.gradients() | self.exposure.gradients(), mask
         )
-        if result.skipped is None:
-            drawn = DrawnView(view, row, mask, visible, positions, splats.opacities, raster.info)
-            self.density.collect(drawn, result.loss, done)
-        return result
+        return result, positions, splats.opacities, raster.info
 
     def state(self) -> TrainingState:
         """Return everything that the steps to come depend on."""

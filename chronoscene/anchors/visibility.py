@@ -11,7 +11,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from chronoscene.kernels.compilation import kernel
+from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.methods import View
 from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.constants import CLAMP_MARGIN, EPS2D, FAR_PLANE
@@ -19,6 +19,7 @@ from chronoscene.training import devices
 
 _EXTENT = 3.33
 """Half width of a footprint in standard deviations: where an opacity of 1 falls below 1/255."""
+_LARGE = 300.0
 _SLACK = CLAMP_MARGIN / 2
 """Share of the image by which the linearised projection may look beyond its edges."""
 
@@ -84,6 +85,12 @@ def _marked(anchors: Tensor, log_scales: Tensor, view: View, near: float, extent
     return visible
 
 
+@inner
+def _usual(log_scales):  # type: ignore[no-untyped-def]
+    """Return True unless an extent is not a number, or too large for its square to be one."""
+    return log_scales[0] < _LARGE and log_scales[1] < _LARGE and log_scales[2] < _LARGE
+
+
 @kernel(parallel=True, extras=[constants])
 def _mark(anchors, log_scales, pose, intrinsics, size, near, extent, mask):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = intrinsics
@@ -100,6 +107,9 @@ def _mark(anchors, log_scales, pose, intrinsics, size, near, extent, mask):  # t
         x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
         y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
         u, v = fx * x / z + cx, fy * y / z + cy
+        if 0.0 < u < width and 0.0 < v < height and _usual(log_scales[i]):
+            mask[i] = True  # however large the footprint
+            continue
         # Diagonal of Sigma' = J W Sigma W^T J^T, as in 3DGS, plus the blur.
         slope_x = min(max(x / z, low_x), high_x)
         slope_y = min(max(y / z, low_y), high_y)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from llvmlite import ir
-from numba import types
+from numba import carray, types
 from numba.core import cgutils
 from numpy import float32
 
@@ -80,6 +80,17 @@ read, write = _make_read(types.float32, FLOAT), _make_write(types.float32, FLOAT
 """One float32."""
 read_index, write_index = _make_read(types.int64, _I64), _make_write(types.int64, _I64)
 """One int64 of those at an address."""
+
+
+@emitted(lambda address: types.voidptr(types.intp))
+def _pointer_to(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    return builder.inttoptr(args[0], context.get_value_type(types.voidptr))
+
+
+@inner
+def floats_at(address, count):  # type: ignore[no-untyped-def]
+    """Return the float32 numbers at an address as an array."""
+    return carray(_pointer_to(address), (count,), float32)
 
 
 @emitted(lambda array, offset, amount: types.int64(array, types.intp, types.int64))

@@ -75,9 +75,7 @@ def check_inputs(inputs: Inputs, finite: bool) -> None:
     """
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
     arrays = {name: getattr(inputs, name) for name in names}
-    for name, size in (("width", inputs.width), ("height", inputs.height)):
-        todo = "correct the argument, or render a larger image in parts"
-        _require(1 <= size <= SIZE_MAX, name, f"1 to {SIZE_MAX} pixels", size, todo)
+    _check_size(inputs)
     _check_shapes(arrays, inputs.backgrounds)
     _check_options(inputs)
     if finite:
@@ -111,6 +109,18 @@ def _check_shapes(arrays: dict[str, Tensor], backgrounds: Tensor | None) -> None
         check_shape(name, arrays[name], shape)
     if backgrounds is not None:
         check_shape("backgrounds", backgrounds, (cameras, arrays["colors"].shape[1]))
+
+
+def check_settings(inputs: Inputs) -> None:
+    """Raise a ShapeError if the size of the image or an option is wrong, whatever the tensors."""
+    _check_size(inputs)
+    _check_options(inputs)
+
+
+def _check_size(inputs: Inputs) -> None:
+    for name, size in (("width", inputs.width), ("height", inputs.height)):
+        todo = "correct the argument, or render a larger image in parts"
+        _require(1 <= size <= SIZE_MAX, name, f"1 to {SIZE_MAX} pixels", size, todo)
 
 
 def _check_options(inputs: Inputs) -> None:

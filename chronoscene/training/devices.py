@@ -14,7 +14,7 @@ from torch import Tensor
 
 def has_kernels(*tensors: Tensor) -> bool:
     """Return True if compiled kernels can work on tensors: float32 on a CPU."""
-    return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+    return all(t.is_cpu and t.dtype is torch.float32 for t in tensors)
 
 
 def to_device(array: NDArray[np.generic], device: str | torch.device) -> Tensor:

@@ -39,12 +39,18 @@ def collect_gradients(
         gradients: Gives the gradients of all optimisers after the pass, by name.
         mask: Where the photo counts; None for everywhere. bool [H, W]
     """
+    loss.backward()
+    return judge_gradients(loss.detach(), info, gradients(), mask)
+
+
+def judge_gradients(
+    loss: Tensor, info: RasterInfo, gradients: Mapping[str, Tensor], mask: Tensor | None = None
+) -> BackwardPass:
+    """Decide whether gradients can be used; arguments as of `collect_gradients`, after the pass."""
     sees = (info.radii > 0).any()
     if mask is not None:
         sees = sees & mask.any()
-    loss.backward()
-    loss = loss.detach()
-    found = {"loss": loss, **gradients()}
+    found = {"loss": loss, **gradients}
     finite = all_finite(list(found.values()))
     value, seen, sound = torch.stack([loss, sees.to(loss), finite.to(loss)]).tolist()
     if not seen:

@@ -96,16 +96,39 @@ def mean_volume(scales: Tensor, opacities: Tensor) -> Tensor:
     return _MeanVolume.apply(scales, opacities)
 
 
+def add_mean_volume(scales: Tensor, opacities: Tensor, weight: float, gradient: Tensor) -> Tensor:
+    """Return the weight times `mean_volume`, and add its gradient in the scales.
+
+    Args:
+        scales: float32 on the CPU, without a graph. [N, 3]
+        opacities: [N]
+        weight: Of the term in the loss.
+        gradient: Changed in place. [N, 3]
+    """
+    value, count = _volume(scales, opacities)
+    factor = np.float32(float(np.float32(weight)) / count)
+    # By itself, as the compiler would round product and sum once.
+    own = np.empty_like(scales.numpy())
+    _volume_gradients(scales.numpy(), opacities.numpy(), factor, own)
+    np.add(gradient.numpy(), own, out=gradient.numpy())
+    return weight * value
+
+
+def _volume(scales: Tensor, opacities: Tensor) -> tuple[Tensor, int]:
+    """Return the mean volume, and of how many Gaussians it is."""
+    chunks = -(-len(scales) // _CHUNK)
+    sums, counts = np.zeros(chunks), np.zeros(chunks, np.int64)
+    _sum_volumes(scales.detach().numpy(), opacities.detach().numpy(), sums, counts)
+    count = max(int(counts.sum()), 1)
+    return scales.new_tensor(sums.sum() / count), count
+
+
 class _MeanVolume(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, scales: Tensor, opacities: Tensor) -> Tensor:
-        chunks = -(-len(scales) // _CHUNK)
-        sums, counts = np.zeros(chunks), np.zeros(chunks, np.int64)
-        values, active = scales.detach().numpy(), opacities.detach().numpy()
-        _sum_volumes(values, active, sums, counts)
+        value, ctx.count = _volume(scales, opacities)
         ctx.save_for_backward(scales, opacities)
-        ctx.count = max(int(counts.sum()), 1)
-        return scales.new_tensor(sums.sum() / ctx.count)
+        return value
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:

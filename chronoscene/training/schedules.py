@@ -41,7 +41,8 @@ def learning_rates(
         progress: Share of the training that is over.
         cooldown: As for `cooled`.
     """
-    found = {name: log_linear(progress, *rate) for name, rate in rates.items()}
+    values = {rate: log_linear(progress, *rate) for rate in set(rates.values())}
+    found = {name: values[rate] for name, rate in rates.items()}
     return cooled(found, progress, cooldown)
 
 

@@ -23,6 +23,7 @@ from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet
 from chronoscene.scene.similarity import Sim3
 from chronoscene.training.checkpoint import save_tensors
+from chronoscene.training.optimizers.adam import BETA1, BETA2
 from chronoscene.training.schedules import log_linear
 
 Make = Callable[..., ChronoGS]
@@ -80,11 +81,12 @@ def test_learning_rates_follow_the_share_that_is_done(
     assert trainer is not None
     optimizer, table = trainer.optimizer.adam, trainer.optimizer.tables["offsets"]
     taken: dict[str, float] = {}
-    step, table_step = optimizer.step, table.step
-    monkeypatch.setattr(optimizer, "step", lambda rates: (taken.update(rates), step(rates)))
-    monkeypatch.setattr(table, "step", lambda rate: (taken.update(offsets=rate), table_step(rate)))
+    updates = optimizer.updates
+    monkeypatch.setattr(optimizer, "updates", lambda rates: taken.update(rates) or updates(rates))
     for index in range(40):
         made.step(index, index / 40)
+        correction = (1 - BETA1 ** (index + 1)) / (1 - BETA2 ** (index + 1)) ** 0.5
+        assert table._speeds[-1] == pytest.approx(taken["offsets"] / correction)
         done = (index + 1) / 40
         factor = 0.1 ** max((done - 0.75) / 0.25, 0.0) if cooldown else 1.0
         for name in ("opacity.w1", "offsets", "global_features"):

@@ -15,6 +15,7 @@ from chronoscene.anchors.decode.forward import (
     gather_inputs,
     hidden_layer,
     task_work,
+    tiled,
 )
 from chronoscene.anchors.decode.layout import BLOCK, CHUNK, CYCLE, Gradients
 from chronoscene.anchors.decode.second_layers import add_biases, add_offset
@@ -43,7 +44,9 @@ ONE = float32(1)
 @inner
 def _has_gradient(grads, g):  # type: ignore[no-untyped-def]
     """Return True if a Gaussian has a gradient: it may be out of the image, or hidden."""
-    found = read(grads.opacities, g) != ZERO
+    if read(grads.opacities, g) != ZERO:
+        return True
+    found = False
     for c in range(3 * g, 3 * g + 3):
         found |= read(grads.colors, c) != ZERO
         found |= read(grads.means, c) != ZERO
@@ -117,9 +120,9 @@ def _anchor_gradient(layout, source, outputs, grads, m, slot, work, done, out): 
 
 
 @inner
-def _output_layer_gradient(layout, weights, work, partial):  # type: ignore[no-untyped-def]
+def _output_layer_gradient(layout, weights, work, rows, partial):  # type: ignore[no-untyped-def]
     """Go back from the raw outputs to the hidden units and the second layers."""
-    for i in range(0, BLOCK * layout.hiddens, LANES):
+    for i in range(0, rows * layout.hiddens, LANES):
         store(work.d_hidden, i, splat(ZERO))
     grads = (work.opacities, work.scales, work.quats, work.colors)
     places = (work.hidden, work.d_hidden, weights.w2, partial.w2)
@@ -138,11 +141,11 @@ def _output_layer_gradient(layout, weights, work, partial):  # type: ignore[no-u
 def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: ignore[no-untyped-def]
     """Go back from hidden units to features and to the first layers."""
     hiddens, inputs, columns = layout.hiddens, layout.inputs_pad, layout.features_pad
-    zero = splat(ZERO)
+    zero, rows = splat(ZERO), tiled(count)
     for i in range(0, count * hiddens, LANES):
         grad = select(zero < load(work.hidden, i), load(work.d_hidden, i), zero)
         store(work.d_hidden, i, grad)
-    for i in range(count * hiddens, BLOCK * hiddens, LANES):
+    for i in range(count * hiddens, rows * hiddens, LANES):
         store(work.d_hidden, i, zero)
     for c in range(0, hiddens, LANES):
         total = load(partial.b1, c)
@@ -151,10 +154,10 @@ def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: igno
         store(partial.b1, c, total)
     d_hidden = (work.d_hidden, 0, hiddens)
     d_w1 = (partial.w1_t, 0, hiddens)
-    product((work.x, 0, 1, inputs), d_hidden, d_w1, d_w1, inputs, hiddens, BLOCK)
+    product((work.x, 0, 1, inputs), d_hidden, d_w1, d_w1, tiled(layout.inputs), hiddens, count)
     w1, zeros = (weights.w1, 0, columns), (weights.zeros, 0, 0)
     d_x = (work.d_x, 0, columns)
-    product((work.d_hidden, 0, hiddens, 1), w1, zeros, d_x, BLOCK, columns, hiddens)
+    product((work.d_hidden, 0, hiddens, 1), w1, zeros, d_x, rows, columns, hiddens)
 
 
 @inner
@@ -177,12 +180,12 @@ def _write_features(layout, source, anchor, d_x, at, out):  # type: ignore[no-un
 @inner
 def _block_gradient(layout, weights, source, outputs, grads, count, work, partial, out):  # type: ignore[no-untyped-def]
     """Add gradients of the visible anchors in the first rows of the work space."""
-    hidden_layer(layout, weights, work, 0, layout.hiddens)
+    hidden_layer(layout, weights, work, count, 0, layout.hiddens)
     done = 0
     for i in range(count):
         m = read_index(work.rows, i)
         done = _anchor_gradient(layout, source, outputs, grads, m, i, work, done, out)
-    _output_layer_gradient(layout, weights, work, partial)
+    _output_layer_gradient(layout, weights, work, count, partial)
     _hidden_layer_gradient(layout, weights, work, count, partial)
     for i in range(count):
         anchor = read_index(source.visible, read_index(work.rows, i))

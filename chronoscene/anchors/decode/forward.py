@@ -13,7 +13,7 @@ from numpy import float32
 
 from chronoscene.anchors.decode.layout import BLOCK, CHUNK, MIN_DISTANCE, MIN_QUAT_NORM, Work
 from chronoscene.kernels.compilation import inner, kernel
-from chronoscene.kernels.matmul import product, relu_product
+from chronoscene.kernels.matmul import ROW_TILE, product, relu_product
 from chronoscene.kernels.memory import (
     copy_quad,
     load,
@@ -106,22 +106,29 @@ def gather_inputs(layout, source, m, x, slot):  # type: ignore[no-untyped-def]
 
 
 @inner
-def hidden_layer(layout, weights, work, first, columns):  # type: ignore[no-untyped-def]
-    """Compute the first layer of some heads for a block."""
-    right = (weights.w1_t, first, layout.hiddens)
-    bias = (weights.b1, first, 0)
-    out = (work.hidden, first, layout.hiddens)
-    inputs = layout.inputs
-    relu_product((work.x, 0, layout.inputs_pad, 1), right, bias, out, BLOCK, columns, inputs)
+def tiled(count):  # type: ignore[no-untyped-def]
+    """Return the rows that matrix products need for so many."""
+    return (count + ROW_TILE - 1) // ROW_TILE * ROW_TILE
 
 
 @inner
-def _output_layer(layout, weights, work, head, first, columns):  # type: ignore[no-untyped-def]
-    """Compute the second layer of a head for a block: ``columns`` outputs from ``first`` on."""
+def hidden_layer(layout, weights, work, count, first, columns):  # type: ignore[no-untyped-def]
+    """Compute the first layer of some heads for ``count`` anchors of a block."""
+    right = (weights.w1_t, first, layout.hiddens)
+    bias = (weights.b1, first, 0)
+    out = (work.hidden, first, layout.hiddens)
+    inputs, rows = layout.inputs, tiled(count)
+    relu_product((work.x, 0, layout.inputs_pad, 1), right, bias, out, rows, columns, inputs)
+
+
+@inner
+def _output_layer(layout, weights, work, count, head, first, columns):  # type: ignore[no-untyped-def]
+    """Compute the second layer of a head for ``count`` anchors of a block: ``columns`` outputs from
+    ``first`` on."""
     left = (work.hidden, head * layout.hidden_pad, layout.hiddens, 1)
     right = (weights.w2_t, first, layout.outputs_pad)
     out = (work.raw, first, layout.outputs_pad)
-    product(left, right, (weights.b2, first, 0), out, BLOCK, columns, layout.hidden)
+    product(left, right, (weights.b2, first, 0), out, tiled(count), columns, layout.hidden)
 
 
 @inner
@@ -160,8 +167,8 @@ def decode_opacities(layout, weights, source, above, out, work, work_size, tasks
             count = min(BLOCK, source.num_visible - begin)
             for i in range(count):
                 gather_inputs(layout, source, begin + i, own.x, i)
-            hidden_layer(layout, weights, own, 0, layout.hidden_pad)
-            _output_layer(layout, weights, own, 0, 0, layout.scales_at)
+            hidden_layer(layout, weights, own, count, 0, layout.hidden_pad)
+            _output_layer(layout, weights, own, count, 0, 0, layout.scales_at)
             for i in range(count):
                 at = i * layout.outputs_pad
                 anchor = read_index(source.visible, begin + i)
@@ -233,10 +240,10 @@ def _activate(work, count, first, out):  # type: ignore[no-untyped-def]
 
 @inner
 def _decode_block(layout, weights, source, count, above, work, out):  # type: ignore[no-untyped-def]
-    hidden_layer(layout, weights, work, layout.hidden_pad, 2 * layout.hidden_pad)
+    hidden_layer(layout, weights, work, count, layout.hidden_pad, 2 * layout.hidden_pad)
     scales, colors = layout.scales_at, layout.colors_at
-    _output_layer(layout, weights, work, 1, scales, colors - scales)
-    _output_layer(layout, weights, work, 2, colors, layout.outputs_pad - colors)
+    _output_layer(layout, weights, work, count, 1, scales, colors - scales)
+    _output_layer(layout, weights, work, count, 2, colors, layout.outputs_pad - colors)
     done = 0
     for i in range(count):
         m = read_index(work.rows, i)

@@ -38,59 +38,41 @@ class Decode(torch.autograd.Function):
     def forward(
         ctx: Any, above: np.float32, fixed: tuple[Tensor, ...], *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        job = _Job(fixed, tensors)
-        count = job.source.num_visible
-        starts = torch.empty(count + 1, dtype=torch.int64)
-        alphas = torch.empty(count * job.layout.offsets)
-        places = Outputs(alphas.data_ptr(), starts.data_ptr(), *([0] * 7))
-        arguments = (job.layout, job.weights, job.source, above)
-        decode_opacities(*arguments, places, *job.work)
-        active = int(starts[-1])
-        index = torch.empty(active, dtype=torch.int64)
-        shapes = ((active, 3), (active, 4), (active, 3), (active,), (active, 3), (active,))
-        outputs = (starts, index, *(torch.empty(shape) for shape in shapes))
-        decode_forward(*arguments, _outputs(alphas, *outputs), *job.work)
+        job = Job(fixed, tensors)
+        outputs = job.forward(above)
         ctx.save_for_backward(*fixed, *tensors, *outputs)
         ctx.job = job
-        ctx.mark_non_differentiable(index)
-        return (*outputs[2:7], index)
+        ctx.mark_non_differentiable(outputs[1])
+        return (*outputs[2:7], outputs[1])
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         # Read here although the job knows them too: torch checks that nobody changed them.
         saved = ctx.saved_tensors
-        fixed, tensors, outputs = saved[:6], saved[6:23], saved[23:]
-        job = ctx.job
-        grads = tuple(grad.contiguous() for grad in grads[:5])
-        out = [torch.empty(tensor.shape) for tensor in tensors]
-        out[2].zero_()
-        sizes = gradient_sizes(job.layout)
-        chunks = max(1, -(-job.source.num_visible // CHUNK))
-        partials = torch.empty(chunks, sum(sizes))
-        partial = Gradients(*place(sizes, partials.data_ptr()))
-        arguments = (job.layout, job.weights, job.source, _outputs(torch.empty(0), *outputs))
-        output_gradients = OutputGradients(*(grad.data_ptr() for grad in grads))
-        anchor_gradients = AnchorGradients(*(tensor.data_ptr() for tensor in out[:4]))
-        gradients = (output_gradients, anchor_gradients, partial, sum(sizes))
-        decode_backward(*arguments, *gradients, *job.work)
-        shared = torch.zeros_like(job.shared)
-        ends = (job.shared.data_ptr(), _heads(out[5:]), shared.data_ptr())
-        unpack_gradients(job.layout, partial, job.heads, *ends)
-        out[4] = fixed[1].detach()[:, None] * shared
-        return None, None, *out
+        return None, None, *ctx.job.backward(saved[23:], grads[:5])
 
 
 def _outputs(*tensors: Tensor) -> Outputs:
     return Outputs(*(tensor.data_ptr() for tensor in tensors))
 
 
-class _Job:
-    """Arguments of the kernels, and the memory behind them."""
+class Job:
+    """One decode, forward and back: arguments of the kernels, and the memory behind them.
+
+    To be used while torch records no gradients.
+
+    Args:
+        fixed: Anchors, period weights, camera centre, visible anchors, used offsets, block rows.
+        tensors: What gets gradients: offsets, features, blocks, log scales, global features, and
+            the weights of the three heads.
+    """
 
     def __init__(self, fixed: Sequence[Tensor], tensors: Sequence[Tensor]) -> None:
-        anchors, weights, centre, visible, used, rows = (_plain(tensor) for tensor in fixed)
+        self._shapes = [tensor.shape for tensor in tensors]
+        self._period_weights = fixed[1].detach()
+        anchors, weights, centre, visible, used, rows = (tensor.contiguous() for tensor in fixed)
         offsets, features, blocks, log_scales, global_features, *heads = (
-            _plain(tensor) for tensor in tensors
+            tensor.contiguous() for tensor in tensors
         )
         self.layout = make_layout(
             base=features.shape[1],
@@ -132,9 +114,52 @@ class _Job:
         plain = (anchors, weights, centre, visible, used, rows, periods)
         self._alive = (*plain, offsets, features, blocks, log_scales, *heads, packed, memory)
 
+    def forward(self, above: np.float32) -> tuple[Tensor, ...]:
+        """Decode the Gaussians with an opacity above a number.
 
-def _plain(tensor: Tensor) -> Tensor:
-    return tensor.detach().contiguous()
+        Returns:
+            starts: First Gaussian of each visible anchor, and L at the end. int64 [M + 1]
+            positions: Of each Gaussian among all M k. int64 [L]
+            splats: Means, quaternions, scales, opacities, colours. [L, .]
+            inverse_norms: See `Outputs`. [L]
+        """
+        count = self.source.num_visible
+        starts = torch.empty(count + 1, dtype=torch.int64)
+        alphas = torch.empty(count * self.layout.offsets)
+        places = Outputs(alphas.data_ptr(), starts.data_ptr(), *([0] * 7))
+        arguments = (self.layout, self.weights, self.source, above)
+        decode_opacities(*arguments, places, *self.work)
+        active = int(starts[-1])
+        index = torch.empty(active, dtype=torch.int64)
+        shapes = ((active, 3), (active, 4), (active, 3), (active,), (active, 3), (active,))
+        outputs = (starts, index, *(torch.empty(shape) for shape in shapes))
+        decode_forward(*arguments, _outputs(alphas, *outputs), *self.work)
+        return outputs
+
+    def backward(self, outputs: Sequence[Tensor], grads: Sequence[Tensor]) -> list[Tensor]:
+        """Return the gradients of the tensors.
+
+        Args:
+            outputs: What `forward` returned.
+            grads: Of means, quaternions, scales, opacities and colours.
+        """
+        grads = [grad.contiguous() for grad in grads]
+        out = [torch.empty(shape) for shape in self._shapes]
+        out[2].zero_()
+        sizes = gradient_sizes(self.layout)
+        chunks = max(1, -(-self.source.num_visible // CHUNK))
+        partials = torch.empty(chunks, sum(sizes))
+        partial = Gradients(*place(sizes, partials.data_ptr()))
+        arguments = (self.layout, self.weights, self.source, _outputs(torch.empty(0), *outputs))
+        output_gradients = OutputGradients(*(grad.data_ptr() for grad in grads))
+        anchor_gradients = AnchorGradients(*(tensor.data_ptr() for tensor in out[:4]))
+        gradients = (output_gradients, anchor_gradients, partial, sum(sizes))
+        decode_backward(*arguments, *gradients, *self.work)
+        shared = torch.zeros_like(self.shared)
+        ends = (self.shared.data_ptr(), _heads(out[5:]), shared.data_ptr())
+        unpack_gradients(self.layout, partial, self.heads, *ends)
+        out[4] = self._period_weights[:, None] * shared
+        return out
 
 
 def _heads(tensors: Sequence[Tensor]) -> tuple[Head, Head, Head]:

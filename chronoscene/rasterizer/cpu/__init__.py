@@ -24,7 +24,7 @@ from chronoscene.rasterizer.cpu.passes import Gaussians, Rendering
 from chronoscene.rasterizer.cpu.project import set_colors
 from chronoscene.rasterizer.inputs import Inputs, recentred
 
-__all__ = ["rasterize"]
+__all__ = ["DirectRender", "rasterize"]
 
 
 def rasterize(inputs: Inputs) -> Rasterization:
@@ -180,6 +180,39 @@ def _background_gradient(image_grad: Tensor, light: AnyArray) -> Tensor:
     """Gradient of the background, summed by numpy in an order independent of threads. [D]"""
     passed = image_grad.numpy() * light[..., None]
     return torch.from_numpy(passed.sum(axis=(0, 1), dtype=np.float64).astype(np.float32))
+
+
+class DirectRender:
+    """One image of three channels without autograd: drawn when this is made, and the way back.
+
+    Args:
+        inputs: One camera with a background, and at least `layout.LANES` Gaussians, contiguous and
+            float32, without depth.
+    """
+
+    info: RasterInfo
+    image: Tensor
+    """[H, W, 3]"""
+
+    def __init__(self, inputs: Inputs) -> None:
+        assert inputs.backgrounds is not None
+        count = len(inputs.means)
+        radii = torch.empty(1, count, 2, dtype=torch.int32)
+        self.info = RasterInfo(torch.empty(1, count, 2), radii, torch.empty(1, count))
+        self._absgrad = torch.zeros(1, count, 2) if inputs.absgrad else None
+        view = make_view(inputs.viewmats[0].double().numpy(), inputs.Ks[0].double().numpy(), inputs)
+        absgrad = None if self._absgrad is None else self._absgrad[0]
+        request = Request(view, _flat(self.info, 0), render_depth=False, absgrad=absgrad)
+        self._job = _Job(inputs.gaussians, inputs.backgrounds[0], request)
+        self._rendering, self.image, _, _ = self._job.forward()
+
+    def backward(self, image_grad: Tensor) -> tuple[Tensor, ...]:
+        """Return the gradients of the Gaussians; that of the centres is in `info`. [H, W, 3]"""
+        *grads, centres = self._job.backward(self._rendering, image_grad, None, None)
+        self.info.means2d.grad = centres[None]
+        if self._absgrad is not None:
+            self.info.means2d.absgrad = self._absgrad  # type: ignore[attr-defined]
+        return tuple(grads)
 
 
 class _Job:

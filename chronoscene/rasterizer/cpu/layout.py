@@ -69,6 +69,9 @@ CAMERA = 36
 CHUNK = 1024  # Gaussians that a thread takes at a time
 
 
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]  # Axes of a cross product
+
+
 @dataclass(frozen=True, slots=True)
 class View:
     """Camera of one image, in the form that the kernels read."""
@@ -95,7 +98,8 @@ def make_view(viewmat: AnyArray, K: AnyArray, inputs: Inputs) -> View:
     camera = np.zeros(CAMERA, np.float32)
     rows = np.asarray(viewmat[:3, :3])
     camera[ROTATION : ROTATION + 9] = rows.reshape(-1)
-    cofactors = np.cross(np.roll(rows, -1, axis=0), np.roll(rows, -2, axis=0))
+    a, b = rows[_NEXT], rows[_LAST]
+    cofactors = a[:, _NEXT] * b[:, _LAST] - a[:, _LAST] * b[:, _NEXT]
     camera[COFACTORS : COFACTORS + 9] = cofactors.reshape(-1)
     centre = _centre(viewmat)
     camera[CENTRE : CENTRE + 3] = centre

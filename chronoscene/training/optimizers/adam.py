@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from numba import prange
 from numpy import float32
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
-from chronoscene.kernels.compilation import kernel
+from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.kernels.memory import floats_at
 from chronoscene.training import devices
 
 BETA1 = 0.9
@@ -41,6 +45,17 @@ class _Moments:
     mean: Tensor
     square: Tensor
     steps: int = 0
+
+
+class Update(NamedTuple):
+    """One step of Adam that is to be done for one tensor; see `adam_block`."""
+
+    value: Tensor
+    """Contiguous."""
+    grad: Tensor
+    moments: _Moments
+    rate: float
+    root: float
 
 
 class Adam:
@@ -78,7 +93,6 @@ class Adam:
         """Return all gradients that there are, by the names of their parameters."""
         return {n: value.grad for n, value in self.params.items() if value.grad is not None}
 
-    @torch.no_grad()
     def step(self, lrs: Mapping[str, float], skip: Collection[str] = ()) -> None:
         """Update every parameter that has a gradient.
 
@@ -86,6 +100,11 @@ class Adam:
             lrs: Learning rate of each parameter.
             skip: Names of parameters to leave alone, with their moments and step counts.
         """
+        apply_updates(self.updates(lrs, skip))
+
+    def updates(self, lrs: Mapping[str, float], skip: Collection[str] = ()) -> list[Update]:
+        """Count a step and return what `apply_updates` has to do for it; arguments as `step`."""
+        found = []
         for name, value in self.params.items():
             if value.grad is None or name in skip:
                 continue
@@ -93,8 +112,8 @@ class Adam:
             moments.steps += 1
             rate = lrs[name] / (1 - BETA1**moments.steps)
             root = (1 - BETA2**moments.steps) ** -0.5
-            update = _step_compiled if devices.has_kernels(value) else _step_torch
-            update(value, value.grad, moments, rate, root)
+            found.append(Update(value, value.grad, moments, rate, root))
+        return found
 
     def extend(self, name: str, new_rows: Tensor) -> Tensor:
         """Append rows [n, ...] with zero moments; return the new leaf, which has no gradient."""
@@ -144,14 +163,35 @@ class Adam:
         return self.params[name]
 
 
-def _step_compiled(
-    value: Tensor, grad: Tensor, moments: _Moments, rate: float, root: float
-) -> None:
-    tensors = (value, grad.contiguous(), moments.mean, moments.square)
-    arrays = [tensor.detach().view(-1).numpy() for tensor in tensors]
+@torch.no_grad()
+def apply_updates(updates: Iterable[Update]) -> None:
+    """Do updates, of any number of tensors in one compiled call."""
+    compiled = []
+    for update in updates:
+        if devices.has_kernels(update.value):
+            compiled.append(update._replace(grad=update.grad.contiguous()))
+        else:
+            _step_torch(*update)
+    if not compiled:
+        return
+    addresses = np.array(
+        [
+            (value.data_ptr(), grad.data_ptr(), m.mean.data_ptr(), m.square.data_ptr())
+            for value, grad, m, _, _ in compiled
+        ]
+    )
+    scalars = np.array([(u.rate, u.root, EPS) for u in compiled], dtype=np.float32)
+    sizes = np.array([u.value.numel() for u in compiled])
     # Starting the threads costs more than a small update.
-    update = adam_blocks if value.numel() > BLOCK else adam_block
-    update(*arrays, float32(rate), float32(root), float32(EPS))
+    run = adam_tensors if sizes.max() > BLOCK else adam_tensors_alone
+    run(addresses, _block_starts(sizes), sizes, scalars)
+
+
+def _block_starts(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of the first block of each array, and of all blocks at the end. [n + 1]"""
+    starts = np.zeros(len(sizes) + 1, np.int64)
+    np.cumsum((sizes + BLOCK - 1) // BLOCK, out=starts[1:])
+    return starts
 
 
 def _step_torch(value: Tensor, grad: Tensor, moments: _Moments, rate: float, root: float) -> None:
@@ -183,25 +223,78 @@ def adam_block(values, grads, means, squares, rate, root, eps):  # type: ignore[
         squares[i] = square
 
 
+@inner
+def _adam_of_block(addresses, starts, sizes, scalars, block):  # type: ignore[no-untyped-def]
+    n = np.searchsorted(starts, block, side="right") - 1
+    first = (block - starts[n]) * BLOCK
+    count, move = min(BLOCK, sizes[n] - first), 4 * first
+    value, grad = floats_at(addresses[n, 0] + move, count), floats_at(addresses[n, 1] + move, count)
+    mean, square = (
+        floats_at(addresses[n, 2] + move, count),
+        floats_at(addresses[n, 3] + move, count),
+    )
+    adam_block(value, grad, mean, square, scalars[n, 0], scalars[n, 1], scalars[n, 2])
+
+
 @kernel(parallel=True)
-def adam_blocks(values, grads, means, squares, rate, root, eps):  # type: ignore[no-untyped-def]
-    """Update a large flat array in place, blocks spread over the threads."""
-    size = values.shape[0]
-    for block in prange((size + BLOCK - 1) // BLOCK):
-        # Slices: an index that is counted from 0 is known not to wrap, so the loop vectorises.
-        part = slice(block * BLOCK, min((block + 1) * BLOCK, size))
-        adam_block(values[part], grads[part], means[part], squares[part], rate, root, eps)
+def adam_tensors(addresses, starts, sizes, scalars):  # type: ignore[no-untyped-def]
+    """Update flat arrays in place, their blocks spread over the threads.
+
+    Args:
+        addresses: Of values, gradients, means and squares of each array. int64 [n, 4]
+        starts: Number of the first block of each array, and of all blocks at the end. [n + 1]
+        sizes: Elements of each. int64 [n]
+        scalars: rate, root and eps of each, as in `adam_block`. float32 [n, 3]
+    """
+    for block in prange(starts[-1]):
+        _adam_of_block(addresses, starts, sizes, scalars, block)
 
 
+@kernel
+def adam_tensors_alone(addresses, starts, sizes, scalars):  # type: ignore[no-untyped-def]
+    """Do what `adam_tensors` does on one thread."""
+    for block in range(starts[-1]):
+        _adam_of_block(addresses, starts, sizes, scalars, block)
+
+
+@torch.no_grad()
 def all_finite(tensors: Sequence[Tensor]) -> Tensor:
     """Return True if no number is nan or infinite; far cheaper than an update of the same size.
 
     Returns:
         A scalar on the device of the tensors. bool
     """
-    # The largest magnitude is nan if any number is.
-    largest = [tensor.detach().abs().amax() for tensor in tensors if tensor.numel()]
-    return torch.stack(largest).isfinite().all() if largest else torch.tensor(True)
+    tensors = [tensor for tensor in tensors if tensor.numel()]
+    if not tensors:
+        return torch.tensor(True)
+    if not devices.has_kernels(*tensors):
+        # The largest magnitude is nan if any number is.
+        return torch.stack([tensor.abs().amax() for tensor in tensors]).isfinite().all()
+    tensors = [tensor.contiguous() for tensor in tensors]
+    sizes = np.array([tensor.numel() for tensor in tensors])
+    starts = _block_starts(sizes)
+    finite = np.empty(starts[-1], np.bool_)
+    _finite_blocks(np.array([t.data_ptr() for t in tensors]), starts, sizes, finite)
+    return torch.tensor(bool(finite.all()))
+
+
+@kernel(parallel=True)
+def _finite_blocks(addresses, starts, sizes, finite):  # type: ignore[no-untyped-def]
+    """Tell for each block of flat arrays whether it is finite; arguments as of `adam_tensors`."""
+    for block in prange(starts[-1]):
+        n = np.searchsorted(starts, block, side="right") - 1
+        first = (block - starts[n]) * BLOCK
+        numbers = floats_at(addresses[n] + 4 * first, min(BLOCK, sizes[n] - first))
+        finite[block] = _is_finite(numbers)
+
+
+@inner
+def _is_finite(numbers):  # type: ignore[no-untyped-def]
+    """Return True if no exponent is that of nan and infinity."""
+    bits, worst = numbers.view(np.int32), np.int32(0)
+    for i in range(bits.shape[0]):
+        worst = max(worst, bits[i] & np.int32(0x7FFFFFFF))
+    return worst < np.int32(0x7F800000)
 
 
 class DenseTable:
@@ -235,19 +328,24 @@ class DenseTable:
         Args:
             rows: Each at most once. int64 [M]
         """
-        leaf = self.value[rows].requires_grad_()
+        leaf = self.value.index_select(0, rows).requires_grad_()
         self._fetched = rows, leaf
         return leaf
 
     def step(self, rate: float) -> None:
         """Do one step with a learning rate; rows that were not fetched have the gradient zero."""
+        apply_updates(self.updates(rate))
+
+    def updates(self, rate: float) -> list[Update]:
+        """Count a step and return what `apply_updates` has to do for it."""
         grad = torch.zeros_like(self.value)
         if self._fetched is not None and (found := self._fetched[1].grad) is not None:
             grad[self._fetched[0]] = found
         self._fetched = None
         self._adam.params["table"].grad = grad
-        self._adam.step({"table": rate})
+        updates = self._adam.updates({"table": rate})
         self._adam.zero_grad()
+        return updates
 
     def flush(self) -> Tensor:
         """Bring all rows up to date; return the table."""

@@ -8,7 +8,8 @@ are next read, all steps at once, so a step costs what it reads, however large t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.kernels.compilation import inner, kernel
-from chronoscene.kernels.memory import load_first, read, read_index, store_first, write_index
+from chronoscene.kernels.memory import (
+    load_first,
+    prefetch,
+    read,
+    read_index,
+    store_first,
+    write_index,
+)
 from chronoscene.kernels.vectors import LANES, select, splat, sqrt
 from chronoscene.training import devices
 from chronoscene.training.optimizers.adam import (
@@ -38,9 +46,13 @@ _HORIZON = 256
 """Steps after which a number that is not read no longer moves: what is left of its way is 2e-12 of
 it."""
 _RATIO = BETA1 / BETA2**0.5
+_POWERS = _RATIO ** np.arange(_HORIZON + 1)
+_SHARES = np.stack([beta ** np.arange(_HORIZON + 1) for beta in (BETA1, BETA2)], axis=1)
 LOG_BETA2 = math.log(BETA2)
 WAY_PARTS = 3
 """Numbers for each gap: way over mean / root of square, and what is left of the two moments."""
+_LENGTH = 6  # Place of `_Rows.length` in a job
+AHEAD = 8  # Rows between the request for one and its use
 CHUNK = 256  # Rows that a task takes at a time
 ZERO = float32(0)
 
@@ -83,26 +95,20 @@ class RowAdam:
         """Rows of the last copies, and these."""
 
     def fetch(self, rows: Tensor) -> Tensor:
-        rows = rows.contiguous()
-        out = torch.empty(len(rows), *self.value.shape[1:])
-        # In units of the root of the second moment without bias correction.
-        eps = float32(EPS * (1 - BETA2 ** max(self.steps, 1)) ** 0.5)
-        _fetch(*self._addresses(rows), eps, out.data_ptr())
-        self._fetched = rows, out.requires_grad_()
-        return out
+        return fetch_together([(self, rows)])[0]
 
     def gradient(self) -> Tensor | None:
         return None if self._fetched is None else self._fetched[1].grad
 
     def step(self, rate: float) -> None:
+        step_together([(self, rate)])
+
+    def _corrections(self, rate: float) -> tuple[float, float]:
+        """Return the rate and the root of the next step, as in `adam_block`."""
         root = (1 - BETA2 ** (self.steps + 1)) ** -0.5
-        corrected = rate / (1 - BETA1 ** (self.steps + 1))
-        if self._fetched is not None and (found := self._fetched[1].grad) is not None:
-            rows, copies = self._fetched
-            grads = found.contiguous()
-            scalars = (float32(corrected), float32(root), float32(EPS))
-            addresses = (copies.data_ptr(), grads.data_ptr())
-            _update(*self._addresses(rows), *addresses, scalars)
+        return rate / (1 - BETA1 ** (self.steps + 1)), root
+
+    def _count_step(self, corrected: float, root: float) -> None:
         self._fetched = None
         self.steps += 1
         self._speeds.append(corrected / root)
@@ -176,14 +182,23 @@ class RowAdam:
         self._stamps = np.full(len(self.value), self.steps, np.int64)
         self._fetched = None
 
-    def _addresses(self, rows: Tensor) -> tuple[_Table, _Rows, _Waits]:
-        """Return the first arguments of both kernels."""
-        tables = (self.value.data_ptr(), self._mean.data_ptr(), self._square.data_ptr())
+    def _job(self, rows: Tensor, copies: Tensor, grads: int = 0) -> tuple[int, ...]:
+        """Return the numbers of `_Table`, `_Rows` and `_Waits`, as the kernels take them."""
         ways, settled = self._ways, self._settled
         return (
-            _Table(*tables, self._columns, self._stamps.ctypes.data),
-            _Rows(rows.data_ptr(), len(rows)),
-            _Waits(self.steps, ways.ctypes.data, len(ways) - 1, settled.ctypes.data),
+            self.value.data_ptr(),
+            self._mean.data_ptr(),
+            self._square.data_ptr(),
+            self._columns,
+            self._stamps.ctypes.data,
+            rows.data_ptr(),
+            len(rows),
+            copies.data_ptr(),
+            grads,
+            self.steps,
+            ways.ctypes.data,
+            len(ways) - 1,
+            settled.ctypes.data,
         )
 
     def _new_ways(self) -> NDArray[np.float32]:
@@ -192,12 +207,12 @@ class RowAdam:
         [G + 1, 3]
         """
         speeds = np.array(self._speeds[-_HORIZON:])
-        gaps = np.arange(len(speeds) + 1)
-        powers = _RATIO ** gaps[1:]
+        count = len(speeds)
         # Summed from the last and smallest term on, each in units of the first step after s.
-        sums = np.cumsum((speeds * powers)[::-1]) / np.concatenate([[1.0], powers])[:-1][::-1]
-        columns = (np.concatenate([[0.0], sums]), BETA1**gaps, BETA2**gaps)
-        return np.stack(columns, axis=1).astype(np.float32)
+        sums = np.cumsum((speeds * _POWERS[1 : count + 1])[::-1]) / _POWERS[:count][::-1]
+        ways = np.empty((count + 1, WAY_PARTS), np.float32)
+        ways[0, 0], ways[1:, 0], ways[:, 1:] = 0.0, sums, _SHARES[: count + 1]
+        return ways
 
 
 class _Table(NamedTuple):
@@ -218,6 +233,10 @@ class _Rows(NamedTuple):
     numbers: int
     """Their address. int64 [M]"""
     length: int
+    copies: int
+    """Address of their copies. [M, columns]"""
+    grads: int
+    """Address of the gradients of the copies."""
 
 
 class _Waits(NamedTuple):
@@ -266,44 +285,109 @@ def _copy(table, row, way, eps, out, m):  # type: ignore[no-untyped-def]
         store_first(out, to + c, value, left)
 
 
-@kernel(parallel=True)
-def _fetch(table, rows, waits, eps, out):  # type: ignore[no-untyped-def]
-    """Copy rows as they are at the present step to the address ``out``. [M, columns]"""
-    for task in prange((rows.length + CHUNK - 1) // CHUNK):
-        for m in range(task * CHUNK, min((task + 1) * CHUNK, rows.length)):
-            row = read_index(rows.numbers, m)
-            way, _, _ = _wait_of(table, row, waits)
-            _copy(table, row, way, eps, out, m)
+@inner
+def _prefetch(table, rows, m):  # type: ignore[no-untyped-def]
+    """Ask for a later row: it may be far from those before."""
+    if m < rows.length:
+        at = read_index(rows.numbers, m) * table.columns
+        for c in range(0, table.columns, LANES):
+            prefetch(table.values, at + c)
+            prefetch(table.means, at + c)
+            prefetch(table.squares, at + c)
 
 
 @inner
-def _step(table, row, keep1, keep2, copies, grads, m, scalars):  # type: ignore[no-untyped-def]
-    rate, root, eps = scalars
+def _part_of(jobs, starts, task):  # type: ignore[no-untyped-def]
+    """Return the number of the job that a task is of, the job, and the task's first and last row.
+
+    ``jobs`` are rows of `RowAdam._job`, and ``starts`` the first task of each.
+    """
+    n = np.searchsorted(starts, task, side="right") - 1
+    j = jobs[n]
+    rows = _Rows(j[5], j[6], j[7], j[8])
+    first = (task - starts[n]) * CHUNK
+    job = (_Table(j[0], j[1], j[2], j[3], j[4]), rows, _Waits(j[9], j[10], j[11], j[12]))
+    return n, job, first, min(first + CHUNK, rows.length)
+
+
+@kernel(parallel=True)
+def _fetch(jobs, starts, eps):  # type: ignore[no-untyped-def]
+    """Copy rows of several tables as they are at the present step. ``eps`` has one per table."""
+    for task in prange(starts[-1]):
+        n, (table, rows, waits), first, stop = _part_of(jobs, starts, task)
+        for m in range(first, stop):
+            row = read_index(rows.numbers, m)
+            _prefetch(table, rows, m + AHEAD)
+            way, _, _ = _wait_of(table, row, waits)
+            _copy(table, row, way, eps[n], rows.copies, m)
+
+
+@inner
+def _step(table, rows, m, row, shares, scalars):  # type: ignore[no-untyped-def]
+    (keep1, keep2), (rate, root, eps) = shares, scalars
     at, to = row * table.columns, m * table.columns
     for c in range(0, table.columns, LANES):
         left = table.columns - c
-        grad = load_first(grads, to + c, left)
+        grad = load_first(rows.grads, to + c, left)
         mean = keep1 * load_first(table.means, at + c, left)
         mean = mean + GAIN1 * (grad - mean)
         square = (KEEP2 * keep2) * load_first(table.squares, at + c, left)
         mean, square = _clean(mean, square + GAIN2 * grad * grad)
         moved = rate * mean / (sqrt(square) * root + eps)
-        store_first(table.values, at + c, load_first(copies, to + c, left) - moved, left)
+        store_first(table.values, at + c, load_first(rows.copies, to + c, left) - moved, left)
         store_first(table.means, at + c, mean, left)
         store_first(table.squares, at + c, square, left)
 
 
 @kernel(parallel=True)
-def _update(table, rows, waits, copies, grads, scalars):  # type: ignore[no-untyped-def]
-    """Do one step of Adam for rows that `_fetch` wrote to the address ``copies``.
+def _update(jobs, starts, scalars):  # type: ignore[no-untyped-def]
+    """Do one step of Adam for the rows of several tables that `_fetch` copied.
 
     Args:
-        grads: Address of the gradients of the copies.
-        scalars: rate, root and eps, as in `adam_block`.
+        jobs: See `_part_of`, like ``starts``.
+        scalars: rate, root and eps of each table, as in `adam_block`. float32 [n, 3]
     """
-    for task in prange((rows.length + CHUNK - 1) // CHUNK):
-        for m in range(task * CHUNK, min((task + 1) * CHUNK, rows.length)):
+    for task in prange(starts[-1]):
+        n, (table, rows, waits), first, stop = _part_of(jobs, starts, task)
+        given = scalars[n, 0], scalars[n, 1], scalars[n, 2]
+        for m in range(first, stop):
             row = read_index(rows.numbers, m)
+            _prefetch(table, rows, m + AHEAD)
             _, keep1, keep2 = _wait_of(table, row, waits)
-            _step(table, row, keep1, keep2, copies, grads, m, scalars)
+            _step(table, rows, m, row, (keep1, keep2), given)
             write_index(table.stamps, row, waits.now + 1)
+
+
+def fetch_together(wanted: Sequence[tuple[RowAdam, Tensor]]) -> list[Tensor]:
+    """Do `RowAdam.fetch` for several tables, in one compiled call."""
+    eps, jobs = [], []
+    for table, rows in wanted:
+        rows = rows.contiguous()
+        copies = torch.empty(len(rows), *table.value.shape[1:])
+        # In units of the root of the second moment without bias correction.
+        eps.append(EPS * (1 - BETA2 ** max(table.steps, 1)) ** 0.5)
+        jobs.append(table._job(rows, copies))
+        table._fetched = rows, copies.requires_grad_()
+    _fetch(*_packed(jobs), np.array(eps, np.float32))
+    return [table._fetched[1] for table, _ in wanted if table._fetched]
+
+
+def step_together(rates: Sequence[tuple[RowAdam, float]]) -> None:
+    """Do `RowAdam.step` for several tables, in one compiled call."""
+    scalars, jobs, alive = [], [], []
+    corrections = [table._corrections(rate) for table, rate in rates]
+    for (table, _), (corrected, root) in zip(rates, corrections, strict=True):
+        if table._fetched is not None and (found := table._fetched[1].grad) is not None:
+            alive.append(found.contiguous())
+            jobs.append(table._job(*table._fetched, alive[-1].data_ptr()))
+            scalars.append((corrected, root, EPS))
+    if jobs:
+        _update(*_packed(jobs), np.array(scalars, np.float32))
+    for (table, _), correction in zip(rates, corrections, strict=True):
+        table._count_step(*correction)
+
+
+def _packed(jobs: Sequence[tuple[int, ...]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return jobs as rows, and the first task of each and the end of all."""
+    tasks = [-(-job[_LENGTH] // CHUNK) for job in jobs]
+    return np.array(jobs), np.array([0, *accumulate(tasks)])

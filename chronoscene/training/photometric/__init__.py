@@ -97,22 +97,39 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     return numerator / ((mu.square() + nu.square() + 0.01**2) * (variances + 0.03**2))
 
 
+def loss_and_gradient(
+    image: Tensor, target: Tensor, *, ssim_weight: float = 0.2
+) -> tuple[Tensor, Tensor]:
+    """Compute `photometric_loss` of float32 images, and its gradient in the image, without a graph.
+
+    Arguments as there.
+    """
+    _check_images(image, target)
+    return _loss_and_gradient(image, target, ssim_weight, True)
+
+
+def _loss_and_gradient(
+    image: Tensor, target: Tensor, ssim_weight: float, wants_gradient: bool
+) -> tuple[Tensor, Tensor]:
+    count = image.numel()
+    weights = ((1 - ssim_weight) / count, ssim_weight / count)
+    if not devices.has_kernels(image):
+        return ssim_torch.l1_ssim(image, _unit_range(target), weights)
+    gradient = torch.empty(image.shape if wants_gradient else (0, *image.shape[1:]))
+    is_byte = target.dtype == torch.uint8
+    arrays = _rows(image), _rows(target if is_byte else target.float())
+    scales = np.float32(255 if is_byte else 1), np.array(weights, dtype=np.float32)
+    difference, dissimilarity = l1_ssim(*arrays, *scales, _rows(gradient))
+    return torch.tensor(weights[0] * difference + weights[1] * dissimilarity), gradient
+
+
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        count = image.numel()
-        weights = ((1 - ssim_weight) / count, ssim_weight / count)
-        if not devices.has_kernels(image):
-            value, gradient = ssim_torch.l1_ssim(image, _unit_range(target), weights)
-            ctx.save_for_backward(gradient)
-            return value
-        gradient = torch.empty(image.shape if ctx.needs_input_grad[0] else (0, *image.shape[1:]))
-        is_byte = target.dtype == torch.uint8
-        arrays = _rows(image), _rows(target if is_byte else target.float())
-        scales = np.float32(255 if is_byte else 1), np.array(weights, dtype=np.float32)
-        difference, dissimilarity = l1_ssim(*arrays, *scales, _rows(gradient))
+        wants = bool(ctx.needs_input_grad[0])
+        value, gradient = _loss_and_gradient(image, target, ssim_weight, wants)
         ctx.save_for_backward(gradient)
-        return torch.tensor(weights[0] * difference + weights[1] * dissimilarity)
+        return value
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor, None, None]:

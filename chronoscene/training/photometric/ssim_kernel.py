@@ -175,10 +175,15 @@ def l1_ssim(image, target, divisor, scales, gradient):  # type: ignore[no-untype
     sums = np.empty((height, 2), dtype=float32)
     for row in prange(framed):
         start = row * stride
+        written = RADIUS <= row < RADIUS + height
         for plane in range(3):
             # The margins have to be zero; the rest is written before it is read.
-            maps[plane * framed * stride + start :][:stride] = ZERO
-        if RADIUS <= row < RADIUS + height:
+            own = maps[plane * framed * stride + start :][:stride]
+            if written:
+                own[:MARGIN], own[stride - MARGIN :] = ZERO, ZERO
+            else:
+                own[:] = ZERO
+        if written:
             _frame_row(image[row - RADIUS], ONE, x, start, stride)
             _frame_row(target[row - RADIUS], divisor, y, start, stride)
         else:

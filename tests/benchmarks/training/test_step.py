@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from numba import get_num_threads
 
 from benchmarks.training.generated import PROGRESS, make, training_set
 from benchmarks.training.gpu_trace import summary
-from benchmarks.training.step import GPU_PARTS, measure
+from benchmarks.training.scaling import ROUND, measure_scaling, parallel_share, print_scaling
+from benchmarks.training.step import GPU_PARTS, PARTS, measure
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.training import devices
 
 
@@ -36,6 +39,28 @@ def test_parts_of_a_step_on_a_gpu(
         assert len(values) == 3 and min(values) >= 0
     parts = sum(sum(values) for part, values in found.items() if part != "step")
     assert parts == pytest.approx(sum(found["step"]))
+
+
+def test_the_parallel_share_of_a_part() -> None:
+    assert parallel_share(10.0, 5.0, 2) == 1.0
+    assert parallel_share(10.0, 10.0, 8) == 0.0
+    assert parallel_share(10.0, 4.0, 4) == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("name", ["chronogs", "3dgs"])
+def test_parts_of_a_step_by_threads(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    threads = get_num_threads()
+    try:
+        found = measure_scaling(
+            name, 200, (24, 16), preset="fast", threads=(1, 2), steps=1, measure=measure
+        )
+    finally:
+        set_threads(threads)
+    print_scaling("title", found, tuple(dict.fromkeys(part for part, _, _ in PARTS)))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == "title" and lines[2].split()[-2:] == ["parallel,", "2"]
+    assert {"rasterize", "loss and its gradient", "check of gradients", "Adam"} <= found[2].keys()
+    assert lines[-1].startswith("step") and len(found[1]["step"]) == ROUND
 
 
 def test_a_trace_of_two_steps() -> None:

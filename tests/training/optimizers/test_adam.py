@@ -70,6 +70,26 @@ def test_large_array_equals_torch_and_any_thread_count() -> None:
     torch.testing.assert_close(results[0], reference.detach(), atol=TOLERANCE, rtol=TOLERANCE)
 
 
+def test_tensors_together_have_the_bits_of_each_alone() -> None:
+    sizes = {"small": 5, "large": 2 * BLOCK + 3, "empty": 0, "double": 7}
+
+    def make() -> Adam:
+        kinds = {"double": torch.float64}
+        return Adam({n: leaf(s, dtype=kinds.get(n, torch.float32)) for n, s in sizes.items()})
+
+    together, alone = make(), make()
+    for step in range(3):
+        for adam in (together, alone):
+            for value in adam.params.values():
+                value.grad = gradient(value, step)
+        together.step(dict.fromkeys(sizes, 0.01) | {"small": 0.02})
+        for name in sizes:
+            others = [other for other in sizes if other != name]
+            alone.step({name: 0.02 if name == "small" else 0.01}, skip=others)
+    for name in sizes:
+        assert torch.equal(together.params[name], alone.params[name])
+
+
 def test_momentum_moves_rows_without_gradient() -> None:
     value = leaf(2, 3)
     adam = Adam({"x": value})

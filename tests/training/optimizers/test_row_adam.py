@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from chronoscene.training.optimizers import row_adam
 from chronoscene.training.optimizers.adam import Adam
-from chronoscene.training.optimizers.row_adam import RowAdam
+from chronoscene.training.optimizers.row_adam import RowAdam, fetch_together, step_together
 
 # Worst of 400 runs: 3e-6 of the rates' sum, by which everything may move.
 TOLERANCE = 1e-5
@@ -128,6 +128,26 @@ def test_a_row_keeps_its_shape() -> None:
     table = RowAdam(torch.zeros(4, 5, 3))
     assert table.fetch(torch.tensor([2, 0])).shape == (2, 5, 3)
     assert RowAdam(torch.zeros(0, 5, 3)).fetch(torch.empty(0, dtype=torch.int64)).shape == (0, 5, 3)
+
+
+def test_tables_together_have_the_bits_of_each_alone() -> None:
+    rng, shapes = np.random.default_rng(3), [(700, 5, 3), (900, 4), (0, 2), (600, 28)]
+    start = [torch.from_numpy(rng.normal(size=s).astype(np.float32)) for s in shapes]
+    together, alone = ([RowAdam(value.clone()) for value in start] for _ in range(2))
+    for _ in range(4):
+        rows = [torch.from_numpy(np.flatnonzero(rng.random(len(t)) < 0.6)) for t in start]
+        copies = fetch_together(list(zip(together, rows, strict=True)))
+        rates = [0.01, 0.02, 0.03, 0.04]
+        for table, seen, copy, rate in zip(alone, rows, copies, rates, strict=True):
+            own = table.fetch(seen)
+            assert torch.equal(own, copy)
+            if rate != 0.04:  # the last has no gradient
+                own.grad = torch.from_numpy(rng.normal(size=own.shape).astype(np.float32))
+                copy.grad = own.grad
+            table.step(rate)
+        step_together(list(zip(together, rates, strict=True)))
+    for a, b in zip(together, alone, strict=True):
+        assert torch.equal(a.flush(), b.flush())
 
 
 def test_equal_bits_for_any_number_of_threads() -> None:
