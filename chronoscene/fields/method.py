@@ -144,11 +144,11 @@ class FieldMethod(ABC):
         generator = np.random.default_rng((self.seed, _STREAM, index))
         if index % INTERVAL == 0:
             self.occupancy.refresh(index, self.probe, generator)
-        count = self.size().primitives
+        count, _ = self._primitives()
         if len(self.pool) == 0:
             return StepReport(0.0, count, "empty")
-        rays = self.pool.draw(generator, self.num_rays)
-        jitter = generator.random(self.num_rays, np.float32)
+        rays = self.draw_rays(generator)
+        jitter = generator.random(len(rays.views), np.float32)
         samples = self.march(rays, self.pool.periods[rays.views], jitter)
         if len(samples.lengths) == 0:
             return StepReport(0.0, count, "empty")
@@ -186,6 +186,10 @@ class FieldMethod(ABC):
         # No step needs a large part of all pixels.
         most = min(self.config.most_rays, len(self.pool) // _PIXELS_PER_RAY)
         self.num_rays = max(_FEWEST_RAYS, min(int(wanted), most))
+
+    def draw_rays(self, generator: np.random.Generator) -> Rays:
+        """Draw the rays of a step."""
+        return self.pool.draw(generator, self.num_rays)
 
     # What rays meet.
 
@@ -328,10 +332,11 @@ class FieldMethod(ABC):
 
     def size(self) -> MethodSize:
         """Count the numbers of the field, and all that are stored."""
+        count, unit = self._primitives()
+        return MethodSize(count, sum(t.numel() for t in self.stored().values()), unit)
+
+    def _primitives(self) -> tuple[int, str]:
         params = self.network.params
-        packed = sum((grid.size + 7) // 8 for grid in self.occupancy.grids)
-        unit = "grid rows" if "table" in params else "weights"
-        count = (
-            len(params["table"]) if "table" in params else sum(p.numel() for p in params.values())
-        )
-        return MethodSize(count, sum(p.numel() for p in params.values()) + packed, unit)
+        if "table" in params:
+            return len(params["table"]), "grid rows"
+        return sum(p.numel() for p in params.values()), "weights"

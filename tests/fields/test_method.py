@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.continual_nerf.method import Memory
+from baselines.continual_nerf.replay import Memory
 from chronoscene.errors import CheckpointError
 from chronoscene.fields.box import box_of, contract
 from chronoscene.fields.method import Drawn, FieldMethod
@@ -43,7 +43,7 @@ def saved(method: FieldMethod, folder: Path) -> bytes:
     return (folder / "model.safetensors").read_bytes()
 
 
-METHODS = ("clnerf", "neusc", "nerf-w")
+METHODS = ("clnerf", "cl-nerf", "neusc", "nerf-w", "ha-nerf")
 
 
 @pytest.mark.parametrize("name", METHODS)
