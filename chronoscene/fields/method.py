@@ -16,7 +16,7 @@ from torch import Tensor
 
 from chronoscene.errors import ShapeError
 from chronoscene.fields.box import SceneBox, box_of, sensible_cells
-from chronoscene.fields.compositing import composite, visible
+from chronoscene.fields.compositing import STOP, composite, visible
 from chronoscene.fields.config import FieldConfig
 from chronoscene.fields.marching import Samples, march
 from chronoscene.fields.mlp import make_groups
@@ -38,7 +38,9 @@ from chronoscene.training.periods import period_weights
 
 _FIRST_RAYS, _FEWEST_RAYS = 256, 64
 _PIXELS_PER_RAY = 64
-_RENDERED_RAYS = 8_192  # At a time
+_RENDERED_RAYS = 2_048  # At a time
+_AT_A_TIME = 16  # Samples of a ray that are evaluated before it is asked whether it goes on
+_OPAQUE = 0.1 - math.log(STOP)  # Optical depth; not the exact one, which is rounded elsewhere
 _STREAM = 1_000  # Number of the random draws of a step, after the seed
 _GRIDS = ("inside", "outside")
 
@@ -209,7 +211,10 @@ class FieldMethod(ABC):
         groups = make_groups(samples.starts, self.device)
         places, lengths = self.tensor(samples.places), self.tensor(samples.lengths)
         distances = self.tensor(samples.distances)
-        densities, features = self.network.density(places, groups, codes.geometry)
+        if torch.is_grad_enabled():
+            densities, features = self.network.density(places, groups, codes.geometry)
+        else:
+            densities, features = self._until_opaque(places, lengths, samples.starts, codes)
         seen, starts = visible(densities, lengths, groups)
         if len(seen) < len(places):  # what is hidden has no weight and no gradient
             groups = make_groups(starts, self.device)
@@ -221,6 +226,33 @@ class FieldMethod(ABC):
         with torch.no_grad():
             reach, _ = composite(densities.detach(), distances[:, None], lengths, groups)
         return Drawn(sums, opacities, self.background), reach[:, 0]
+
+    def _until_opaque(
+        self, places: Tensor, lengths: Tensor, starts: NDArray[np.int64], codes: Codes
+    ) -> tuple[Tensor, Tensor]:
+        """Evaluate densities and features from the camera on, until nothing behind is seen.
+
+        What is behind has the density 0, and features that mean nothing.
+        """
+        densities, features = torch.zeros_like(lengths), places.new_empty(len(places), 0)
+        counts, done = np.diff(starts), 0
+        depths = np.zeros(len(counts), np.float32)
+        going = np.flatnonzero(counts)
+        while len(going):
+            taken = np.minimum(counts[going] - done, _AT_A_TIME)
+            ends = np.concatenate(([0], np.cumsum(taken)))
+            first = starts[going] + done - ends[:-1]
+            chosen = self.tensor(np.arange(ends[-1]) + np.repeat(first, taken))
+            groups, code = make_groups(ends, self.device), codes.geometry[self.tensor(going)]
+            found, values = self.network.density(places[chosen], groups, code)
+            if features.shape[1] == 0:
+                features = values.new_empty(len(places), values.shape[1])
+            densities[chosen], features[chosen] = found, values
+            passed = (found * lengths[chosen]).cpu().numpy()
+            depths[going] += np.add.reduceat(passed, ends[:-1])
+            done += _AT_A_TIME
+            going = going[(depths[going] < _OPAQUE) & (counts[going] > done)]
+        return densities, features
 
     @torch.no_grad()
     def probe(self, places: NDArray[np.float32], period: int) -> NDArray[np.float32]:

@@ -215,6 +215,35 @@ def test_a_far_place_is_rendered_behind_the_box() -> None:
     assert ((samples.places >= 0) & (samples.places < 1)).all()
 
 
+@pytest.mark.parametrize("shift", [-3.0, 8.0])
+def test_what_is_hidden_is_not_evaluated_in_renders(
+    shift: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = begun("clnerf", make_training_set(1))
+    network, density = method.network, method.network.density
+    count = 0
+
+    def counted(places: Any, *rest: Any) -> Any:
+        nonlocal count
+        count += len(places)
+        found, features = density(places, *rest)
+        return found * float(np.exp(shift)), features
+
+    monkeypatch.setattr(network, "density", counted)
+    rays = view_rays(make_training_set(1).views[0], np.arange(200))
+    samples = method.march(rays, np.zeros(200, np.int64), np.full(200, 0.5, np.float32))
+    codes = method.codes(rays)
+    trained, far = method.draw(rays, samples, codes)
+    assert count == len(samples.lengths)
+    with torch.no_grad():
+        rendered, near = method.draw(rays, samples, codes)
+    assert torch.equal(trained.rgb, rendered.rgb)
+    assert torch.equal(trained.opacities, rendered.opacities)
+    assert torch.equal(far, near)
+    share = count / len(samples.lengths) - 1
+    assert share == 1 if shift < 0 else share < 0.5
+
+
 def test_a_photo_of_transient_things_alone_is_not_rendered() -> None:
     """Rendered views of NeRF-W have no transient density, whatever the head says."""
     method = begun("nerf-w", make_training_set(1))
