@@ -1,4 +1,4 @@
-"""CLNeRF and MEIL-NeRF: periods come one by one, renderings of earlier ones are replayed."""
+"""CLNeRF, MEIL-NeRF and CL-NeRF: periods come one by one, and earlier ones are replayed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ _COMMON: dict[str, Any] = {
     "period_input": "continuous",
     "outputs": ("rgb", "alpha", "depth"),
     "devices": ("cpu",),
-    "config": "baselines.continual_nerf.config:ContinualConfig",
     "per_period": ("paper",),
     "mixes_views": True,
     "learns_background": True,
@@ -43,6 +42,7 @@ SPEC = MethodSpec(
     title="CLNeRF",
     paper="Cai and Müller, CLNeRF: Continual Learning Meets NeRF, ICCV 2023",
     licence="Apache-2.0 (the official code, too)",
+    config="baselines.continual_nerf.config:ContinualConfig",
     method="baselines.continual_nerf.method:CLNeRF",
     presets=_presets({}),
     **_COMMON,
@@ -53,7 +53,19 @@ MEIL_NERF = MethodSpec(
     paper="Chung et al., MEIL-NeRF: Memory-Efficient Incremental Learning of Neural Radiance "
     "Fields, arXiv 2212.08328",
     licence="Apache-2.0 (so is its version in the repository of CLNeRF)",
+    config="baselines.continual_nerf.config:ContinualConfig",
     method="baselines.continual_nerf.method:MEILNeRF",
     presets=_presets({"replay_loss": "charbonnier"}),
+    **_COMMON,
+)
+CL_NERF = MethodSpec(
+    name="cl-nerf",
+    title="CL-NeRF",
+    paper="Wu et al., CL-NeRF: Continual Learning of Neural Radiance Fields for Evolving Scene "
+    "Representation, NeurIPS 2023",
+    licence="Apache-2.0 (no official code was found)",
+    config="baselines.continual_nerf.config:AdaptorConfig",
+    method="baselines.continual_nerf.cl_nerf:CLNerf",
+    presets=_presets({"start": "warm"}),
     **_COMMON,
 )

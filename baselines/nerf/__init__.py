@@ -1,4 +1,4 @@
-"""NeRF, NeRF-T, NeRF-W and NeuSC: one class and its flags."""
+"""NeRF, NeRF-W, Ha-NeRF, their variants that know the time, and NeuSC: one class and its flags."""
 
 from __future__ import annotations
 
@@ -74,6 +74,45 @@ NERF_W = MethodSpec(
     method="baselines.nerf.method:NerfW",
     presets=_presets({"appearance": "image", "transient": "density"}),
     **_COMMON,
+)
+NERF_W_T = MethodSpec(
+    name="nerf-w-t",
+    title="NeRF-W-T",
+    paper="Martin-Brualla et al., NeRF in the Wild, CVPR 2021, with the time as a further input",
+    licence="Apache-2.0",
+    period_input="continuous",
+    method="baselines.nerf.method:NerfWT",
+    presets=_presets({"appearance": "image", "transient": "density", "time": "frequencies"}),
+    **_COMMON,
+)
+_HA: dict[str, Any] = {"appearance": "encoder", "transient": "mask"}
+
+
+def _ha_presets(flags: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    presets = _presets(_HA | flags)
+    paper = {"frequencies": 15, "channels": 64, "photo_size": 128, "photos": 1}
+    return presets | {"paper": presets["paper"] | paper}
+
+
+HA_NERF = MethodSpec(
+    name="ha-nerf",
+    title="Ha-NeRF",
+    paper="Chen et al., Hallucinated Neural Radiance Fields in the Wild, CVPR 2022",
+    licence="Apache-2.0 (the official code names no licence)",
+    period_input="label",
+    method="baselines.nerf.ha_nerf:HaNerf",
+    presets=_ha_presets({}),
+    **_COMMON | {"config": "baselines.nerf.config:HaNerfConfig"},
+)
+HA_NERF_T = MethodSpec(
+    name="ha-nerf-t",
+    title="Ha-NeRF-T",
+    paper="Chen et al., Ha-NeRF, CVPR 2022, with the time as a further input",
+    licence="Apache-2.0",
+    period_input="continuous",
+    method="baselines.nerf.ha_nerf:HaNerfT",
+    presets=_ha_presets({"time": "frequencies"}),
+    **_COMMON | {"config": "baselines.nerf.config:HaNerfConfig"},
 )
 NEUSC = MethodSpec(
     name="neusc",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from chronoscene.fields.config import FieldConfig
 
@@ -18,8 +18,9 @@ class NerfConfig(FieldConfig):
     time: Literal["none", "frequencies", "steps"] = "none"
     """Dependence of colours on the time t = period / (T - 1): not; by sines and cosines of it
     (NeRF-T); by learned step functions, so that content switches (NeuSC)."""
-    appearance: Literal["none", "image"] = "none"
-    """``image``: a learned code of the light for each photo."""
+    appearance: Literal["none", "image", "encoder"] = "none"
+    """Code of a photo's light: none; ``image``, a learned one for each photo; ``encoder``, what a
+    network makes of the photo (Ha-NeRF)."""
     transient: Literal["none", "density", "mask"] = "none"
     """Treatment of what is only in one photo: none; a density and an uncertainty that are left out
     of renders (NeRF-W); a mask of the photo that weakens the loss (NeuSC, Ha-NeRF)."""
@@ -41,3 +42,19 @@ class NerfConfig(FieldConfig):
     """Added to the uncertainty of NeRF-W."""
     transient_weight: NonNegativeFloat = 0.01
     """Weight of the mean transient density."""
+
+
+@dataclass(frozen=True)
+class HaNerfConfig(NerfConfig):
+    """Options of Ha-NeRF."""
+
+    channels: PositiveInt = 16
+    """Channels of the first convolution; the others have twice, and then four times as many."""
+    photo_size: Annotated[int, Field(ge=16)] = 32
+    """Width and height of photos for the encoder, in pixels."""
+    photos: PositiveInt = 16
+    """Photos that the rays of a step are drawn from."""
+    encoder_rate: PositiveFloat = 5e-4
+    """Learning rate of the encoder at the start."""
+    code_weight: NonNegativeFloat = 1e-5
+    """Weight of the mean square of the codes."""

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from baselines.nerf.config import NerfConfig
@@ -73,28 +74,35 @@ class Nerf(FieldMethod):
         return self.tensor((periods / last).astype(np.float32))
 
     def codes(self, rays: Rays) -> Codes:
-        views, params = self.tensor(rays.views), self.network.params
+        params = self.network.params
         every = self.time_code(self.times(np.arange(int(self.meta["num_periods"]))))
         color = every.index_select(0, self.tensor(self.pool.periods[rays.views]))
-        if "light_codes" in params:
-            color = torch.cat((color, params["light_codes"].index_select(0, views)), dim=1)
-        geometry = torch.zeros(len(views), 0, device=views.device)
+        if self.config.appearance != "none":
+            color = torch.cat((color, self.lights(rays.views)), dim=1)
+        geometry = color[:, :0]
         if "transient_codes" in params:
-            geometry = params["transient_codes"].index_select(0, views)
+            geometry = params["transient_codes"].index_select(0, self.tensor(rays.views))
         return Codes(geometry, color)
+
+    def lights(self, views: NDArray[np.int64]) -> Tensor:
+        """Return the code of the light of each photo. [R] -> [R, A]"""
+        return self.network.params["light_codes"].index_select(0, self.tensor(views))
 
     def view_codes(self, geometry_period: float, appearance_period: float) -> Codes:
         """Return the codes of a view; no transient things."""
         weights = period_weights(appearance_period, int(self.meta["num_periods"]))
         color = self.time_code(self.times(np.array([appearance_period])))
-        if "light_codes" in self.network.params:
-            periods = np.array(self.meta["image_periods"])
-            counts = np.bincount(periods, minlength=len(weights))
-            shares = self.tensor((weights / np.maximum(counts, 1))[periods].astype(np.float32))
-            lights = self.network.params["light_codes"]
-            light = (shares[:, None] * lights).sum(0, keepdim=True) / shares.sum()
-            color = torch.cat((color, light), dim=1)
+        if self.config.appearance != "none":
+            color = torch.cat((color, self.mean_light(weights)), dim=1)
         return Codes(color[:, :0], color)
+
+    def mean_light(self, weights: NDArray[np.float32]) -> Tensor:
+        """Return the mean code of the photos of periods with weights. [T] -> [1, A]"""
+        periods = np.array(self.meta["image_periods"])
+        counts = np.bincount(periods, minlength=len(weights))
+        shares = self.tensor((weights / np.maximum(counts, 1))[periods].astype(np.float32))
+        lights = self.network.params["light_codes"]
+        return (shares[:, None] * lights).sum(0, keepdim=True) / shares.sum()
 
     def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:
         target = self.tensor(rays.colors)
@@ -105,7 +113,8 @@ class Nerf(FieldMethod):
         if self.config.transient == "mask":
             mask = self._masks(rays)
             kept = 1 - mask
-            loss = 0.5 * (kept * squares).mean() + self.config.mask_weight * mask.square().mean()
+            loss = 0.5 * (kept * squares).mean()
+            loss = loss + self.mask_weight(progress) * mask.square().mean()
             kept = kept.detach()
         else:
             kept = torch.ones_like(squares[:, :1])
@@ -114,6 +123,11 @@ class Nerf(FieldMethod):
             content = drawn.values[:, 3:6] + clear
             loss = loss + self.config.content_weight * (kept * (content - target).square()).mean()
         return loss
+
+    def mask_weight(self, progress: float) -> float:
+        """Return the weight of the squared mask."""
+        del progress
+        return self.config.mask_weight
 
     def _uncertain_loss(self, squares: Tensor, drawn: Drawn) -> Tensor:
         """Error over the uncertainty of each ray, as in NeRF-W, equation 13."""
@@ -148,6 +162,12 @@ class NerfW(Nerf):
     """
 
     name = "nerf-w"
+
+
+class NerfWT(NerfW):
+    """NeRF-W whose colours know the time."""
+
+    name = "nerf-w-t"
 
 
 class NeuSC(Nerf):

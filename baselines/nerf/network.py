@@ -28,7 +28,7 @@ class NerfNetwork(FieldNetwork):
     @classmethod
     def begin(cls, config: NerfConfig, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw the tensors of a new field."""
-        light = config.appearance_size if config.appearance == "image" else 0
+        light = config.appearance_size if config.appearance != "none" else 0
         color = time_size(config) + light
         params = cls.initial(config, 0, color, generator)
         if config.transient == "density":

@@ -110,8 +110,8 @@ class _Encode(torch.autograd.Function):
         rows = int(ctx.levels[1][-1])
         out = torch.zeros(rows, FEATURES)
         tasks = numba.get_num_threads()
-        given = grads[0].contiguous().numpy()
-        encode_backward(ctx.places.numpy(), given, *ctx.levels, tasks, out.numpy())
+        given = grads[0].contiguous().view(-1).numpy()
+        encode_backward(ctx.places.numpy(), given, *ctx.levels, tasks, out.view(-1).numpy())
         return out, None, None
 
 

@@ -6,7 +6,7 @@ from numba import prange
 from numpy import float32, int64, uint32
 
 from chronoscene.kernels.compilation import inlined, kernel
-from chronoscene.kernels.memory import make_load, store
+from chronoscene.kernels.memory import make_load, read, store
 from chronoscene.kernels.vectors import make_splat, multiply_add
 
 BLOCK = 8192  # Places for which a level is read before the next one displaces it in the cache
@@ -65,9 +65,9 @@ def encode_backward(places, grads, resolutions, starts, dense, tasks, out):  # t
     """Add the gradient of the table; a level belongs to one task, so that sums have one order.
 
     Args:
-        grads: Of the output of `encode_forward`. [N, 2 L]
+        grads: Of the output of `encode_forward`. Flat [N, 2 L].
         tasks: Into how many tasks to divide the levels; does not change the result.
-        out: Zeros, added to. [E, 2]
+        out: Zeros, added to. Flat [E, 2].
     """
     count, levels = places.shape[0], resolutions.shape[0]
     for task in prange(tasks):
@@ -76,9 +76,10 @@ def encode_backward(places, grads, resolutions, starts, dense, tasks, out):  # t
             points, mask = resolutions[level] + 1, uint32(starts[level + 1] - start - 1)
             is_dense = dense[level]
             for i in range(count):
-                first, second = grads[i, 2 * level], grads[i, 2 * level + 1]
-                if first == ZERO and second == ZERO:
+                at = 2 * (i * levels + level)
+                if read(grads, at) == ZERO and read(grads, at + 1) == ZERO:
                     continue
+                grad = _load_pair(grads, at)
                 px, py, pz = places[i, 0] * cells, places[i, 1] * cells, places[i, 2] * cells
                 x, y, z = int(px), int(py), int(pz)
                 fx, fy, fz = px - float32(x), py - float32(y), pz - float32(z)
@@ -90,5 +91,4 @@ def encode_backward(places, grads, resolutions, starts, dense, tasks, out):  # t
                         * (fz if cz else ONE - fz)
                     )
                     row = start + _row(is_dense, points, mask, x + cx, y + cy, z + cz)
-                    out[row, 0] += weight * first
-                    out[row, 1] += weight * second
+                    store(out, 2 * row, multiply_add(grad, weight, _load_pair(out, 2 * row)))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from chronoscene.errors import ShapeError
 from chronoscene.fields.box import SceneBox, box_of, sensible_cells
-from chronoscene.fields.compositing import composite, visible
+from chronoscene.fields.compositing import STOP, composite, visible
 from chronoscene.fields.config import FieldConfig
 from chronoscene.fields.marching import Samples, march
 from chronoscene.fields.mlp import make_groups
@@ -38,7 +38,9 @@ from chronoscene.training.periods import period_weights
 
 _FIRST_RAYS, _FEWEST_RAYS = 256, 64
 _PIXELS_PER_RAY = 64
-_RENDERED_RAYS = 8_192  # At a time
+_RENDERED_RAYS = 2_048  # At a time
+_AT_A_TIME = 16  # Samples of a ray that are evaluated before it is asked whether it goes on
+_OPAQUE = 0.1 - math.log(STOP)  # Optical depth; not the exact one, which is rounded elsewhere
 _STREAM = 1_000  # Number of the random draws of a step, after the seed
 _GRIDS = ("inside", "outside")
 
@@ -144,11 +146,11 @@ class FieldMethod(ABC):
         generator = np.random.default_rng((self.seed, _STREAM, index))
         if index % INTERVAL == 0:
             self.occupancy.refresh(index, self.probe, generator)
-        count = self.size().primitives
+        count, _ = self._primitives()
         if len(self.pool) == 0:
             return StepReport(0.0, count, "empty")
-        rays = self.pool.draw(generator, self.num_rays)
-        jitter = generator.random(self.num_rays, np.float32)
+        rays = self.draw_rays(generator)
+        jitter = generator.random(len(rays.views), np.float32)
         samples = self.march(rays, self.pool.periods[rays.views], jitter)
         if len(samples.lengths) == 0:
             return StepReport(0.0, count, "empty")
@@ -187,6 +189,10 @@ class FieldMethod(ABC):
         most = min(self.config.most_rays, len(self.pool) // _PIXELS_PER_RAY)
         self.num_rays = max(_FEWEST_RAYS, min(int(wanted), most))
 
+    def draw_rays(self, generator: np.random.Generator) -> Rays:
+        """Draw the rays of a step."""
+        return self.pool.draw(generator, self.num_rays)
+
     # What rays meet.
 
     def tensor(self, array: NDArray[Any]) -> Tensor:
@@ -205,7 +211,10 @@ class FieldMethod(ABC):
         groups = make_groups(samples.starts, self.device)
         places, lengths = self.tensor(samples.places), self.tensor(samples.lengths)
         distances = self.tensor(samples.distances)
-        densities, features = self.network.density(places, groups, codes.geometry)
+        if torch.is_grad_enabled():
+            densities, features = self.network.density(places, groups, codes.geometry)
+        else:
+            densities, features = self._until_opaque(places, lengths, samples.starts, codes)
         seen, starts = visible(densities, lengths, groups)
         if len(seen) < len(places):  # what is hidden has no weight and no gradient
             groups = make_groups(starts, self.device)
@@ -217,6 +226,33 @@ class FieldMethod(ABC):
         with torch.no_grad():
             reach, _ = composite(densities.detach(), distances[:, None], lengths, groups)
         return Drawn(sums, opacities, self.background), reach[:, 0]
+
+    def _until_opaque(
+        self, places: Tensor, lengths: Tensor, starts: NDArray[np.int64], codes: Codes
+    ) -> tuple[Tensor, Tensor]:
+        """Evaluate densities and features from the camera on, until nothing behind is seen.
+
+        What is behind has the density 0, and features that mean nothing.
+        """
+        densities, features = torch.zeros_like(lengths), places.new_empty(len(places), 0)
+        counts, done = np.diff(starts), 0
+        depths = np.zeros(len(counts), np.float32)
+        going = np.flatnonzero(counts)
+        while len(going):
+            taken = np.minimum(counts[going] - done, _AT_A_TIME)
+            ends = np.concatenate(([0], np.cumsum(taken)))
+            first = starts[going] + done - ends[:-1]
+            chosen = self.tensor(np.arange(ends[-1]) + np.repeat(first, taken))
+            groups, code = make_groups(ends, self.device), codes.geometry[self.tensor(going)]
+            found, values = self.network.density(places[chosen], groups, code)
+            if features.shape[1] == 0:
+                features = values.new_empty(len(places), values.shape[1])
+            densities[chosen], features[chosen] = found, values
+            passed = (found * lengths[chosen]).cpu().numpy()
+            depths[going] += np.add.reduceat(passed, ends[:-1])
+            done += _AT_A_TIME
+            going = going[(depths[going] < _OPAQUE) & (counts[going] > done)]
+        return densities, features
 
     @torch.no_grad()
     def probe(self, places: NDArray[np.float32], period: int) -> NDArray[np.float32]:
@@ -328,10 +364,11 @@ class FieldMethod(ABC):
 
     def size(self) -> MethodSize:
         """Count the numbers of the field, and all that are stored."""
+        count, unit = self._primitives()
+        return MethodSize(count, sum(t.numel() for t in self.stored().values()), unit)
+
+    def _primitives(self) -> tuple[int, str]:
         params = self.network.params
-        packed = sum((grid.size + 7) // 8 for grid in self.occupancy.grids)
-        unit = "grid rows" if "table" in params else "weights"
-        count = (
-            len(params["table"]) if "table" in params else sum(p.numel() for p in params.values())
-        )
-        return MethodSize(count, sum(p.numel() for p in params.values()) + packed, unit)
+        if "table" in params:
+            return len(params["table"]), "grid rows"
+        return sum(p.numel() for p in params.values()), "weights"

@@ -89,7 +89,9 @@ class PixelPool:
                 chosen = np.sort(generator.choice(chosen, most, replace=False))
             pixels.append(chosen)
             colors.append(image.reshape(-1, 3)[chosen])
-        self.ends = np.cumsum([len(chosen) for chosen in pixels])
+        self.counts = np.array([len(chosen) for chosen in pixels])
+        """Pixels of each view. [V]"""
+        self.ends = np.cumsum(self.counts)
         self._pixels = np.concatenate(pixels)
         self._colors = np.concatenate(colors)
         self._sizes = np.array([(view.width, view.height) for view in self.views])
@@ -101,9 +103,16 @@ class PixelPool:
     def __len__(self) -> int:
         return len(self._pixels)
 
-    def draw(self, generator: np.random.Generator, count: int) -> Rays:
-        """Draw rays of all views, with replacement."""
-        chosen = generator.integers(len(self), size=count)
+    def draw(
+        self, generator: np.random.Generator, count: int, of: NDArray[np.int64] | None = None
+    ) -> Rays:
+        """Draw rays of all views, or ``of`` some by their numbers, with replacement."""
+        if of is None:
+            chosen = generator.integers(len(self), size=count)
+        else:
+            ends = np.cumsum(self.counts[of])
+            chosen = generator.integers(ends[-1], size=count)
+            chosen += (self.ends[of] - ends)[np.searchsorted(ends, chosen, side="right")]
         views = np.searchsorted(self.ends, chosen, side="right")
         rows, columns = np.divmod(self._pixels[chosen], self._sizes[views, 0])
         image = np.stack([columns + 0.5, rows + 0.5, np.ones(count)], axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.continual_nerf.method import Memory
+from baselines.continual_nerf.replay import Memory
 from chronoscene.errors import CheckpointError
 from chronoscene.fields.box import box_of, contract
 from chronoscene.fields.method import Drawn, FieldMethod
@@ -43,7 +43,7 @@ def saved(method: FieldMethod, folder: Path) -> bytes:
     return (folder / "model.safetensors").read_bytes()
 
 
-METHODS = ("clnerf", "neusc", "nerf-w")
+METHODS = ("clnerf", "cl-nerf", "neusc", "nerf-w", "ha-nerf")
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -213,6 +213,35 @@ def test_a_far_place_is_rendered_behind_the_box() -> None:
     ends = samples.starts[1:] - 1
     assert (samples.distances[ends] > 5).all()
     assert ((samples.places >= 0) & (samples.places < 1)).all()
+
+
+@pytest.mark.parametrize("shift", [-3.0, 8.0])
+def test_what_is_hidden_is_not_evaluated_in_renders(
+    shift: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = begun("clnerf", make_training_set(1))
+    network, density = method.network, method.network.density
+    count = 0
+
+    def counted(places: Any, *rest: Any) -> Any:
+        nonlocal count
+        count += len(places)
+        found, features = density(places, *rest)
+        return found * float(np.exp(shift)), features
+
+    monkeypatch.setattr(network, "density", counted)
+    rays = view_rays(make_training_set(1).views[0], np.arange(200))
+    samples = method.march(rays, np.zeros(200, np.int64), np.full(200, 0.5, np.float32))
+    codes = method.codes(rays)
+    trained, far = method.draw(rays, samples, codes)
+    assert count == len(samples.lengths)
+    with torch.no_grad():
+        rendered, near = method.draw(rays, samples, codes)
+    assert torch.equal(trained.rgb, rendered.rgb)
+    assert torch.equal(trained.opacities, rendered.opacities)
+    assert torch.equal(far, near)
+    share = count / len(samples.lengths) - 1
+    assert share == 1 if shift < 0 else share < 0.5
 
 
 def test_a_photo_of_transient_things_alone_is_not_rendered() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from chronoscene.cli.options import (
     LPIPS_WEIGHTS,
@@ -20,6 +21,7 @@ from chronoscene.cli.options import (
 from chronoscene.cli.output import check_place, say
 from chronoscene.cli.report.results import print_runs
 from chronoscene.formats import nearby_scenes
+from chronoscene.harness.files.protocols import PROTOCOLS
 from chronoscene.harness.files.records import read_failures
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.settings import (
@@ -58,6 +60,12 @@ WIDTH = click.option(
     "strategies",
     default="joint",
     help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.",
+)
+@click.option(
+    "--protocol",
+    type=click.Choice([*PROTOCOLS]),
+    help="Run as published for the data of another paper: format, periods, test images, sizes and "
+    "the order of the periods are fixed.",
 )
 @reading_options("the scenes")
 @training_options
@@ -114,8 +122,16 @@ WIDTH = click.option(
 @click.option(
     "--overwrite", is_flag=True, help="Replace finished runs that were made with other settings."
 )
+@click.pass_context
 def command(
-    methods: str, strategies: str, seeds: int, seed: int, out: Path, **options: Any
+    context: click.Context,
+    *,
+    methods: str,
+    seeds: int,
+    seed: int,
+    out: Path,
+    protocol: str | None,
+    **options: Any,
 ) -> None:
     """Train, render and score methods on scenes.
 
@@ -126,11 +142,16 @@ def command(
     """
     names = split_list("--method", methods)
     look_here_for(names)
+    if protocol:
+        fixed = PROTOCOLS[protocol].options().items()
+        source = context.get_parameter_source
+        options |= {k: v for k, v in fixed if source(k) is ParameterSource.DEFAULT}
+    options["strategies"] = split_list("--strategy", options["strategies"])
     settings = settings_from(
         methods=names,
-        strategies=split_list("--strategy", strategies),
         seeds=tuple(range(seed, seed + seeds)),
         out=out,
+        protocol=protocol or "",
         **options,
     )
     report(run_bench(settings, say), out)

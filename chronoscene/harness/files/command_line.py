@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
-OPTIONS = ("iterations", "budget", "separate_iterations", "max_width")
+OPTIONS = ("iterations", "budget", "separate_iterations", "max_width", "protocol")
 """Names in a variant that are options of ``bench``, not of the method."""
 
 

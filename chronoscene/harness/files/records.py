@@ -135,6 +135,8 @@ class RunRecord(BaseModel):
     preset: str
     variant: str = ""
     """Options that differ from the preset, such as ``sh_degree=2``."""
+    protocol: str = ""
+    """Name in `PROTOCOLS` of the protocol that the run was made under, or empty."""
     method_version: str
     config_hash: str
     """Hash of everything that decides the result but scene, seed, device and threads."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from chronoscene.formats import DetectedFormat, detect
 from chronoscene.harness.files.records import SOURCE_FILE, read_document
+from chronoscene.images.store import resize_camera
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.scene import Scene
 from chronoscene.scene.similarity import Sim3
@@ -28,7 +31,8 @@ class RunOrigin(BaseModel):
     period_by: str | None = None
     """Rule by which the images are grouped into periods, as for `read_scene`."""
     validation: bool = False
-    """Argument of `read_bench_scene`."""
+    """Argument of `read_bench_scene`, as the next one."""
+    shrink: int = 1
 
     def read_scene(self, root: Path | None = None) -> Scene:
         """Read the scene, from ``root`` if it has moved.
@@ -38,7 +42,7 @@ class RunOrigin(BaseModel):
         """
         place = root or Path(self.scene_root)
         found = detect(place, format=self.scene_format, period_by=self.period_by)
-        return read_bench_scene(found, validation=self.validation)
+        return read_bench_scene(found, validation=self.validation, shrink=self.shrink)
 
 
 class RunSource(RunOrigin):
@@ -70,19 +74,36 @@ def read_source(folder: Path) -> RunSource:
     )
 
 
-def read_bench_scene(found: DetectedFormat, *, validation: bool) -> Scene:
+def read_bench_scene(found: DetectedFormat, *, validation: bool, shrink: int = 1) -> Scene:
     """Read a scene as runs have it: bench, its workers, and whoever opens a run later.
 
     Args:
         found: Folder of the scene, with its format.
         validation: True for the training views alone, some of which are test views.
+        shrink: Divisor of the width and height of all images.
 
     Raises:
         SceneError: If the scene cannot be read, or has too few views for validation.
     """
     scene = found.read()
+    if shrink > 1:
+        scene = _shrunk(scene, shrink)
     if validation:
         from chronoscene.scene.split_making import hold_out_validation  # scipy takes time to load
 
         return hold_out_validation(scene)
     return scene
+
+
+def _shrunk(scene: Scene, divisor: int) -> Scene:
+    """Scale the cameras of a scene down; images follow when they are read."""
+    old = [frame.camera for frame in scene.frames]
+    new = [resize_camera(c, *(max(1, size // divisor) for size in c.size)) for c in old]
+    pairs = zip(scene.frames, new, strict=True)
+    scales = np.array([c.size for c in new]) / np.array([c.size for c in old])
+    points = scene.points
+    track_xy = points.track_xy * scales[points.track_frame]
+    return replace(
+        scene.with_frames([replace(frame, camera=camera) for frame, camera in pairs]),
+        points=replace(points, track_xy=track_xy),
+    )

@@ -72,6 +72,7 @@ def _runs_of_scene(
                 scene_format=scene.content.format,
                 period_by=scene.period_by,
                 validation=own.validation,
+                shrink=own.shrink,
             ),
             scene=scene.content.name,
             scene_hash=scene.hash,

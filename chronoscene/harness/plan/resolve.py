@@ -75,6 +75,8 @@ class ResolvedMethod:
             differ["separate_iterations"] = settings.separate_iterations
         if settings.validation:
             differ["validation"] = True
+        if settings.protocol:
+            differ["protocol"] = settings.protocol
         variant = ",".join(f"{k}={as_typed(v)}" for k, v in differ.items())
         return ResolvedRun.of(replace(job, variant=variant), self.spec, config)
 
@@ -109,6 +111,7 @@ class ResolvedRun:
             "max_width": settings.max_width,
             **({"continued_from": job.continued_from} if job.continued_from else {}),
             **({"validation": True} if settings.validation else {}),
+            **({"protocol": settings.protocol} if settings.protocol else {}),
         }
         decides = json.loads(json.dumps(decides))
         document = {

@@ -38,7 +38,9 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
     scenes: dict[str, tuple[Scene, str | None]] = {}
     for found in settings.scenes:
         log(f"read {found.path}")
-        scene = read_bench_scene(found, validation=settings.run.validation)
+        scene = read_bench_scene(
+            found, validation=settings.run.validation, shrink=settings.run.shrink
+        )
         if scene.name in scenes:
             raise ConfigError(
                 scene.root,

@@ -12,6 +12,7 @@ from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.formats import DetectedFormat, find_scenes
 from chronoscene.formats.shared.grouping import absolute_rule
+from chronoscene.harness.files.protocols import PROTOCOLS, check_protocol
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.methods import is_preset_file, preset_name
@@ -52,11 +53,18 @@ class RunSettings:
     """Bytes that training photos may take in memory, those that are being decoded included."""
     photo_disk: int = PHOTO_DISK
     """Bytes that decoded photos may take on disk."""
+    protocol: str = ""
+    """Name in `PROTOCOLS`, or empty."""
     checkpoint_seconds: float = 300.0
     """Time from one checkpoint of a training to the next."""
     keep_training: bool = False
     """True if finished runs keep what it takes to train them further."""
     lpips_weights: Path | None = None
+
+    @property
+    def shrink(self) -> int:
+        """Divisor of the width and height of all images."""
+        return PROTOCOLS[self.protocol].shrink if self.protocol else 1
 
     @property
     def preset_name(self) -> str:
@@ -89,13 +97,17 @@ class BenchSettings:
         """Refuse settings that contradict each other.
 
         Raises:
-            ConfigError: If a strategy or a way of sharing is unknown, or several options give a
-                number of iterations, of which one would win silently.
+            ConfigError: If a strategy or a way of sharing is unknown, several options give a number
+                of iterations, of which one would win silently, or one contradicts the protocol.
         """
         for strategy in self.strategies:
             check_choice("--strategy", strategy, STRATEGIES)
         if self.run.separate_iterations is not None:
             check_choice("--separate-iterations", self.run.separate_iterations, SHARING)
+        if self.run.protocol:
+            run = self.run
+            fixed = self.scenes, self.strategies, run.max_width, run.validation
+            check_protocol(run.protocol, *fixed)
         overrides = self.run.overrides
         given = {
             "--continue-to": self.continue_to,

@@ -1,11 +1,11 @@
 """Definition of what may be compared, for tables, figures, trade-offs, studies, leaderboard.
 
-Scores are compared within a *test*: equal scene and photos, test views and width. Methods are
-ranked on the leaderboard if they had the same *effort* as well: the same time on the same device
-where there was a budget, else as many training steps, those of all models or stages together. A
-preset is no effort: those named ``paper`` have from 18,000 to 40,000 steps. Elsewhere efforts may
-differ, and notes say so. Times are compared on one device only (`TIMES` of `summary`). What a paper
-printed is in no test: its photos, test views and hardware are not known to be ours.
+Scores are compared within a *test*: equal scene and photos, test views, width and protocol. Methods
+are ranked on the leaderboard if they had the same *effort* as well: the same time on the same
+device where there was a budget, else as many training steps, those of all models or stages
+together. A preset is no effort: those named ``paper`` have from 18,000 to 40,000 steps. Elsewhere
+efforts may differ, and notes say so. Times are compared on one device only (`TIMES` of `summary`).
+What a paper printed is in no test: its photos, test views and hardware are not known to be ours.
 """
 
 from __future__ import annotations
@@ -23,8 +23,15 @@ KEY = (
     *("config_hash", "max_width", "device"),
 )
 """Fields of `RunRecord` in which the seeds of a configuration agree on one device."""
-_FIELDS = {"width": "max_width", "split": "split_hash", "scene": "scene_hash"}
-_MEANING = {"width": "--max-width", "split": "test views", "scene": "photos, poses or points"}
+_FIELDS = {
+    "width": "max_width", "protocol": "protocol", "split": "split_hash", "scene": "scene_hash"
+}  # fmt: skip
+_MEANING = {
+    "width": "--max-width",
+    "protocol": "--protocol",
+    "split": "test views",
+    "scene": "photos, poses or points",
+}
 _APART = re.compile(rf" \[(?:{'|'.join(_FIELDS)}) [^]]*\]")
 
 
@@ -35,6 +42,7 @@ class Setting(NamedTuple):
     scene_hash: str
     split_hash: str
     max_width: int
+    protocol: str
     effort: str
 
     @property
@@ -45,7 +53,8 @@ class Setting(NamedTuple):
 
 def setting_of(run: RunRecord) -> Setting:
     """Return the setting of a run."""
-    return Setting(run.scene, run.scene_hash, run.split_hash, run.max_width, effort_of(run))
+    test = run.scene, run.scene_hash, run.split_hash, run.max_width, run.protocol
+    return Setting(*test, effort_of(run))
 
 
 def effort_of(run: RunRecord) -> str:
@@ -87,10 +96,15 @@ def apart(records: Sequence[RunRecord]) -> list[RunRecord]:
         if len(of_scene) == 1:
             continue
         names = [
-            {kind: str(getattr(run, field))[:6] for kind, field in _FIELDS.items()}
+            {
+                kind: str(getattr(run, field))[: 6 if field.endswith("hash") else None] or "none"
+                for kind, field in _FIELDS.items()
+            }
             for run in of_scene.values()
         ]
-        differing = [kind for kind in ("width", "split") if len({n[kind] for n in names}) > 1]
+        differing = [
+            kind for kind in ("width", "protocol", "split") if len({n[kind] for n in names}) > 1
+        ]
         if len({tuple(n[kind] for kind in differing) for n in names}) < len(names):
             differing.append("scene")  # its hash covers the split, too
         values = {kind: ", ".join(dict.fromkeys(n[kind] for n in names)) for kind in differing}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from chronoscene.checks import check_choice
@@ -13,6 +13,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import UNTRAINED, Failure, RunRecord
 from chronoscene.harness.files.strategies import period_part
 from chronoscene.harness.report.comparable import effort_of, several_scenes
+from chronoscene.harness.report.protocol_tables import protocol_rows, protocol_tables
 from chronoscene.harness.report.summary import (
     AGGREGATES,
     COSTS,
@@ -88,12 +89,17 @@ def format_runs(
         listed = listed.assign(sd=["" if n == 1 else repr(sd) for n, sd in sds])
         return str(listed.to_csv(columns=ENTRY_COLUMNS, index=False, lineterminator="\n"))
     notes = footnotes(entries, records, failures, metrics)
+    beside = []
     if published is not None:
         notes += published_notes(published, records)
+        beside = protocol_rows(published, records)
     if style == "json":
         found = [json_entry(entry) for entry in listed[[*ENTRY_COLUMNS]].to_dict("records")]
-        return json.dumps({"entries": found, "notes": notes}, indent=1, allow_nan=False) + "\n"
-    made = readable_tables(entries, records, metrics, periods=periods)
+        document: dict[str, Any] = {"entries": found, "notes": notes}
+        if beside:
+            document["protocols"] = [asdict(row) for row in beside]
+        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    made = protocol_tables(beside) + readable_tables(entries, records, metrics, periods=periods)
     made = with_columns(made, columns) if columns else made
     if any(table.ranks for table in made):
         notes.insert(0, tables.LEGENDS[style])
@@ -473,7 +479,9 @@ def _grouped(pairs: Iterable[tuple[Any, Any]]) -> Iterable[tuple[Any, str]]:
 def published_notes(table: PublishedTable, records: Sequence[RunRecord]) -> list[str]:
     """List the notes on published rows, and the scenes that have none."""
     known = {row.scene.casefold() for row in table.rows}
-    strange = dict.fromkeys(run.scene for run in records if run.scene.casefold() not in known)
+    strange = dict.fromkeys(
+        run.scene for run in records if not (run.protocol or run.scene.casefold() in known)
+    )
     notes = [f"published: {table.title}; {table.hardware}. {' '.join(table.notes)}"]
     if strange:
         scenes = ", ".join(dict.fromkeys(row.scene for row in table.rows))

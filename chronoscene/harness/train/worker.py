@@ -327,6 +327,7 @@ def _record(
         title=spec.title_of(job.settings.preset_name),
         preset=job.settings.preset_name,
         variant=job.variant,
+        protocol=job.settings.protocol,
         method_version=method_version(job.origin.method),
         config_hash=run.document["config_hash"],
         scene_hash=job.scene_hash,

@@ -248,3 +248,19 @@ def test_a_failed_bench_has_status_1(make_scene_folder, monkeypatch):
     result = CliRunner().invoke(cli, ["bench", str(make_scene_folder()), "--method", "m"])
     assert result.exit_code == 1
     assert "failed: s, m: because" in result.output
+
+
+def test_a_protocol_gives_the_options_that_are_not_named(make_scene_folder, monkeypatch, tmp_path):
+    images = {f"{task}/{i}.png": p for p, task in enumerate(("a", "b")) for i in range(3)}
+    scene = make_scene_folder(images, name="kitchen")
+    (scene / "sparse/split.txt").unlink()
+    given = []
+    monkeypatch.setattr(bench_module, "run_bench", lambda settings, log: given.append(settings))
+    monkeypatch.setattr(bench_module, "report", lambda outcome, out: None)
+    words = ("bench", str(scene), "--method", "clnerf", "--protocol", "wat")
+    run_command(*words, "--out", tmp_path / "runs")
+    run_command(*words, "--out", tmp_path / "runs", "--strategy", "joint")
+    assert [settings.strategies for settings in given] == [("sequential",), ("joint",)]
+    assert given[0].scenes[0].name == "wat" and given[0].run.protocol == "wat"
+    refused = run_command(*words, "--out", tmp_path / "runs", "--max-width", "1600")
+    assert refused.exit_code != 0 and "error: --max-width: expected 65536" in refused.stderr

@@ -1,0 +1,116 @@
+"""Ha-NeRF as a plug-in: the light of a photo is what an encoder sees in it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from baselines.nerf.config import HaNerfConfig
+from baselines.nerf.encoder import encode_photos, initial_encoder, small_photo
+from baselines.nerf.method import Nerf
+from chronoscene.fields.method import Drawn
+from chronoscene.fields.network import named
+from chronoscene.fields.rays import PixelPool, Rays
+from chronoscene.methods import StepReport, TrainingSet
+
+_BATCH = 64  # Photos that are encoded at a time
+_LEAST_MASK_WEIGHT, _MASK_DECAY = 0.006, 1e-3  # As in the official command lines; per step
+
+
+class HaNerf(Nerf):
+    """NeRF with the light of each photo from an encoder, and masks of transient things.
+
+    A rendered view has the mean code of the training photos of its period; the model stores these
+    means, and no photo.
+
+    Source: Chen et al. 2022, "Hallucinated Neural Radiance Fields in the Wild".
+    """
+
+    name = "ha-nerf"
+    config: HaNerfConfig
+    photos: Tensor | None = None
+    """Small training photos, -1..1; None for a loaded model. [V, 3, S, S]"""
+
+    def make_pool(self, train: TrainingSet) -> PixelPool:
+        pool = super().make_pool(train)
+        size = self.config.photo_size
+        indices = range(len(train.views))
+        small = [small_photo(train.load_image(i), train.load_mask(i), size) for i in indices]
+        values = np.stack(small).astype(np.float32).transpose(0, 3, 1, 2) / np.float32(127.5) - 1
+        self.photos = self.tensor(values)
+        self._means: Tensor | None = None
+        return pool
+
+    def initial(self, train: TrainingSet, generator: torch.Generator) -> dict[str, Tensor]:
+        params = super().initial(train, generator)
+        layers = initial_encoder(self.config.channels, self.config.appearance_size, generator)
+        return params | named("encoder", layers)
+
+    def begin(self, params: Any) -> None:
+        super().begin(params)
+        self._means = None
+
+    def step(self, index: int, progress: float) -> StepReport:
+        report = super().step(index, progress)
+        self._means = None
+        return report
+
+    def draw_rays(self, generator: np.random.Generator) -> Rays:
+        """Draw rays of some photos, since each of these has to be encoded."""
+        seen = np.flatnonzero(self.pool.counts)
+        count = min(self.config.photos, len(seen))
+        return self.pool.draw(
+            generator, self.num_rays, np.sort(generator.choice(seen, count, replace=False))
+        )
+
+    def lights(self, views: NDArray[np.int64]) -> Tensor:
+        assert self.photos is not None
+        found, places = np.unique(views, return_inverse=True)
+        photos = self.photos.index_select(0, self.tensor(found))
+        self._codes = encode_photos(photos, self.network.layers("encoder"))
+        return self._codes.index_select(0, self.tensor(places))
+
+    def mean_light(self, weights: NDArray[np.float32]) -> Tensor:
+        return (self.tensor(weights)[:, None] * self.period_lights()).sum(0, keepdim=True)
+
+    @torch.no_grad()
+    def period_lights(self) -> Tensor:
+        """Return the mean code of the training photos of each period. [T, A]"""
+        if self.photos is None:
+            return self.network.params["period_lights"]
+        if self._means is None:
+            layers = self.network.layers("encoder")
+            codes = torch.cat([encode_photos(part, layers) for part in self.photos.split(_BATCH)])
+            periods = self.tensor(self.pool.periods)
+            chosen = [codes[periods == i] for i in range(int(self.meta["num_periods"]))]
+            self._means = torch.stack([part.sum(0) / max(len(part), 1) for part in chosen])
+        return self._means
+
+    def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:
+        return super().loss(drawn, rays, progress) + (
+            self.config.code_weight * self._codes.square().mean()
+        )
+
+    def rates(self, progress: float) -> dict[str, float]:
+        rates = super().rates(progress)
+        share = self.config.encoder_rate / self.config.network_rate
+        return {n: share * r if n.startswith("encoder") else r for n, r in rates.items()}
+
+    def mask_weight(self, progress: float) -> float:
+        """Return the weight of the squared mask; masks are cheaper and cheaper."""
+        steps = progress * self.config.iterations
+        return max(_LEAST_MASK_WEIGHT, self.config.mask_weight * math.exp(-_MASK_DECAY * steps))
+
+    def stored(self) -> dict[str, Tensor]:
+        return super().stored() | {"period_lights": self.period_lights()}
+
+
+class HaNerfT(HaNerf):
+    """Ha-NeRF whose colours know the time."""
+
+    name = "ha-nerf-t"
