@@ -157,6 +157,6 @@ def _info(meta: dict[str, Any], drawable: Tensor) -> RasterInfo:
     if means2d.requires_grad:
         means2d.retain_grad()
     visible = (radii > 0).all(-1)
-    # The kernel leaves the rows of culled Gaussians as it finds them in memory, and never reads them.
+    # The kernel leaves rows of culled Gaussians as it finds them in memory, and never reads them.
     means2d.data.masked_fill_(~visible[..., None], 0)
     return RasterInfo(means2d, radii, torch.where(visible, meta["depths"].detach(), 0))
