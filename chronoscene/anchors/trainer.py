@@ -106,9 +106,9 @@ class AnchorTrainer:
         learned = self._learn_directly(seen, view, row, photo) if plain else None
         if learned is None:
             learned = self._learn_by_autograd(seen, number, photo, mask)
-        result, *facts = learned
+        result, positions, opacities, info = learned
         if result.skipped is None:
-            drawn = DrawnView(view, row, mask, visible, *facts)
+            drawn = DrawnView(view, row, mask, visible, positions, opacities, info)
             self.density.collect(drawn, result.loss, done)
         return result
 
