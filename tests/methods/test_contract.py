@@ -16,7 +16,7 @@ from chronoscene.harness.contract.training import (
     threads_change_nothing_for_many_points,
 )
 from chronoscene.methods import load_spec, method_names
-from chronoscene.training.photometric import _PhotometricLoss
+from chronoscene.training import photometric
 
 QUICK = [name for name in method_names() if not load_spec(name).mixes_views]
 """Radiance fields take long; ``tests/fields`` has what is quick of the rules."""
@@ -61,14 +61,14 @@ def test_saving_a_training_and_a_step_that_is_not_finite_change_nothing(
     if subject.spec.mixes_views:
         pytest.skip("its steps have no photo and no loss of photos")
     method = subject.resumed(subject.interrupted)
-    backward = _PhotometricLoss.backward
+    compute = photometric._loss_and_gradient
 
-    def poisoned(ctx, *grads):
-        gradient, *others = backward(ctx, *grads)
-        return gradient * np.inf, *others
+    def poisoned(*args):
+        loss, gradient = compute(*args)
+        return loss, gradient * np.inf
 
     with monkeypatch.context() as patch:
-        patch.setattr(_PhotometricLoss, "backward", staticmethod(poisoned))
+        patch.setattr(photometric, "_loss_and_gradient", poisoned)
         assert method.step(PAUSE, PAUSE / STEPS).skipped == "not finite"
     method.trainer.sampler.drawn -= 1
     method.save_training(tmp_path)
