@@ -6,7 +6,9 @@ from tests.made_runs import record
 
 def test_differences_are_to_the_first_row_with_the_same_seed():
     def of(seed, psnr):
-        return record(seed=seed, psnr=(psnr, psnr), ssim=(0.5, 0.7), primitives=1_000 + 1_000 * seed)
+        return record(
+            seed=seed, psnr=(psnr, psnr), ssim=(0.5, 0.7), primitives=1_000 + 1_000 * seed
+        )
 
     first = [of(0, 20.0), of(1, 22.0), of(2, 24.0)]
     rows = table_rows({"as it is": first, "other": [of(2, 23.5), of(0, 19.0)], "failed": []})
