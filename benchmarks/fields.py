@@ -21,7 +21,7 @@ from chronoscene.fields.compositing import composite
 from chronoscene.fields.config import FieldConfig
 from chronoscene.fields.mlp import make_groups
 from chronoscene.fields.network import FieldNetwork
-from chronoscene.kernels.runtime import set_threads
+from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.training import devices
 
 RAYS, SAMPLES = 4_096, 24
@@ -98,6 +98,7 @@ def networks_alone(batch: Batch) -> Callable[[], None]:
 def main(threads: int, rounds: int, log2_rows: int) -> None:
     """Time the field and print million samples a second."""
     set_threads(threads)
+    keep_freed_memory()
     batch, config = make_batch(), FieldConfig(log2_rows=log2_rows)
     generator = torch.Generator().manual_seed(1)
     params = FieldNetwork.initial(config, GEOMETRY, COLOR, generator)

@@ -101,7 +101,8 @@ class _Encode(torch.autograd.Function):
         out = torch.empty(len(places), layout.width)
         levels = layout.resolutions, layout.starts, layout.dense
         flat = table.detach().contiguous().view(-1).numpy()
-        encode_forward(places.numpy(), flat, *levels, out.view(-1).numpy())
+        tasks = numba.get_num_threads()
+        encode_forward(places.numpy(), flat, *levels, tasks, out.view(-1).numpy())
         ctx.places, ctx.levels = places, levels
         return out
 

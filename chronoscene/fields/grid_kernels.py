@@ -9,7 +9,7 @@ from chronoscene.kernels.compilation import inlined, kernel
 from chronoscene.kernels.memory import make_load, read, store
 from chronoscene.kernels.vectors import make_splat, multiply_add
 
-BLOCK = 8192  # Places for which a level is read before the next one displaces it in the cache
+BLOCK = 8192  # Places of a task, at least
 PRIMES = (uint32(2654435761), uint32(805459861))
 ONE = float32(1)
 ZERO = float32(0)
@@ -26,8 +26,10 @@ def _row(dense, points, mask, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @kernel(fast_math=True, parallel=True)
-def encode_forward(places, table, resolutions, starts, dense, out):  # type: ignore[no-untyped-def]
+def encode_forward(places, table, resolutions, starts, dense, tasks, out):  # type: ignore[no-untyped-def]
     """Interpolate the features of all levels; arguments as of `grid.encode`.
+
+    A level fills the cache, so a task reads it once, for all of its places.
 
     Args:
         places: [N, 3]
@@ -35,15 +37,17 @@ def encode_forward(places, table, resolutions, starts, dense, out):  # type: ign
         resolutions: Cells along an edge. int64 [L]
         starts: First row of each level, and the end. int64 [L + 1]
         dense: Whether each grid point has a row of its own. bool [L]
+        tasks: Into how many tasks to divide the places, at most; does not change the result.
         out: Written. Flat [N, 2 L].
     """
     count, levels = places.shape[0], resolutions.shape[0]
-    for block in prange((count + BLOCK - 1) // BLOCK):
+    size = max(BLOCK, (count + tasks - 1) // tasks)
+    for task in prange((count + size - 1) // size):
         for level in range(levels):
             cells, start = float32(resolutions[level]), starts[level]
             points, mask = resolutions[level] + 1, uint32(starts[level + 1] - start - 1)
             is_dense = dense[level]
-            for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
+            for i in range(task * size, min(count, (task + 1) * size)):
                 px, py, pz = places[i, 0] * cells, places[i, 1] * cells, places[i, 2] * cells
                 x, y, z = int(px), int(py), int(pz)
                 fx, fy, fz = px - float32(x), py - float32(y), pz - float32(z)

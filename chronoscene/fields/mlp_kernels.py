@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.matmul import product, relu_product
-from chronoscene.kernels.memory import load, load_first, read, set_zero, store, store_first
+from chronoscene.kernels.memory import load, load_first, set_zero, store, store_first
 from chronoscene.kernels.vector_math import sigmoid
-from chronoscene.kernels.vectors import LANES, select, splat
+from chronoscene.kernels.vectors import LANES, absolute, any_lane, select, splat
 
 BLOCK = 64  # Rows that go through all layers together
 SLICE = 1024  # Gradients of weights summed over the chunks by one task
@@ -42,14 +42,14 @@ class Layers(NamedTuple):
     bias: NDArray[np.int64]
     """[K]"""
     hidden: NDArray[np.int64]
-    """Place of each hidden layer in a row of the activations. [K]"""
+    """Place of each hidden layer among the activations, in numbers of a row. [K]"""
     inputs: int
     outputs: int
     shared: int
     """Numbers that a group shares."""
     shared_pad: int
     row: int
-    """Numbers in a row of the activations."""
+    """Activations of a row, in all hidden layers."""
     size: int
     """Numbers of all weights without the transposes: they come last."""
     sigmoid: bool
@@ -78,6 +78,13 @@ def _shared_part(layers, weights, shared, first, last, work, out):  # type: igno
         product((work, 0, pad, 1), right, zero, into, BLOCK, hidden, layers.shared)
 
 
+@inner
+def _kept(layers, acts, rows, layer, row):  # type: ignore[no-untyped-def]
+    """Activations of a hidden layer from a row on, as a matrix."""
+    width = layers.widths[layer + 1]
+    return acts, rows * layers.hidden[layer] + row * width, width
+
+
 @kernel(parallel=True)
 def mlp_forward(layers, weights, x, shared, starts, groups, chunks, acts, out):  # type: ignore[no-untyped-def]
     """Compute the outputs of all rows, and keep the hidden layers.
@@ -90,7 +97,7 @@ def mlp_forward(layers, weights, x, shared, starts, groups, chunks, acts, out): 
         starts: First row of each group, and the end. int64 [R + 1]
         groups: Group of each row. int32 [N]
         chunks: First group of each chunk, and the end. int64 [C + 1]
-        acts: Flat [N, row], written if not empty.
+        acts: Hidden layers one after the other, written if not empty. Flat [N x row]
         out: Flat [N, O], written.
     """
     depth = len(layers.widths) - 1
@@ -104,37 +111,36 @@ def mlp_forward(layers, weights, x, shared, starts, groups, chunks, acts, out): 
         _shared_part(layers, weights, shared, first, last, work, common)
         for row in range(starts[first], starts[last], BLOCK):
             count = min(BLOCK, starts[last] - row)
-            left, right = work, other
-            _copy_rows(x, row, layers.inputs, left, layers.widths[0], count)
+            _copy_rows(x, row, layers.inputs, work, layers.widths[0], count)
+            left = (work, 0, layers.widths[0], 1)
             for layer in range(depth):
                 inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
+                into = (other if layer % 2 == 0 else work, 0, outputs)
+                kept = _kept(layers, acts, starts[-1], layer, row)
+                # The last block of a chunk is longer than the chunk.
+                straight = keep and layer < depth - 1 and count == BLOCK
+                if straight:
+                    into = kept
                 matrix = (weights, layers.matrix[layer], outputs)
-                a, into = (left, 0, inputs, 1), (right, 0, outputs)
+                bias = (weights, layers.bias[layer], 0)
                 if layer == 0:
                     for i in range(BLOCK):
                         place = (groups[row + min(i, count - 1)] - first) * hidden
                         for c in range(0, hidden, LANES):
-                            store(right, i * hidden + c, load(common, place + c))
-                    if depth == 1:
-                        product(a, matrix, into, into, BLOCK, outputs, inputs)
-                    else:
-                        relu_product(a, matrix, into, into, BLOCK, outputs, inputs)
-                elif layer == depth - 1:
-                    bias = (weights, layers.bias[layer], 0)
-                    product(a, matrix, bias, into, BLOCK, outputs, inputs)
+                            store(into[0], into[1] + i * hidden + c, load(common, place + c))
+                    bias = into
+                if layer == depth - 1:
+                    product(left, matrix, bias, into, BLOCK, outputs, inputs)
                 else:
-                    bias = (weights, layers.bias[layer], 0)
-                    relu_product(a, matrix, bias, into, BLOCK, outputs, inputs)
-                if keep and layer < depth - 1:
-                    for i in range(count):
-                        at = (row + i) * layers.row + layers.hidden[layer]
-                        for c in range(0, outputs, LANES):
-                            store(acts, at + c, load(right, i * outputs + c))
-                left, right = right, left
+                    relu_product(left, matrix, bias, into, BLOCK, outputs, inputs)
+                if keep and layer < depth - 1 and not straight:
+                    for i in range(0, count * outputs, LANES):
+                        store(acts, kept[1] + i, load(into[0], i))
+                left = (into[0], into[1], outputs, 1)
             width = layers.widths[depth]
             for i in range(count):
                 for c in range(0, width, LANES):
-                    value = load(left, i * width + c)
+                    value = load(left[0], i * width + c)
                     if layers.sigmoid:
                         value = sigmoid(value)
                     store_first(out, (row + i) * layers.outputs + c, value, layers.outputs - c)
@@ -154,9 +160,9 @@ def _output_gradient(layers, out, grads, row, count, target):  # type: ignore[no
     """Gradient before the last activation; True if any number is not zero."""
     width = layers.widths[-1]
     _copy_rows(grads, row, layers.outputs, target, width, count)
-    found = ZERO
-    for i in range(count * width):
-        found += abs(read(target, i))
+    total = splat(ZERO)
+    for i in range(0, count * width, LANES):
+        total = total + absolute(load(target, i))
     if layers.sigmoid:
         for i in range(count):
             for c in range(0, width, LANES):
@@ -164,7 +170,7 @@ def _output_gradient(layers, out, grads, row, count, target):  # type: ignore[no
                 value = load_first(out, at, left)
                 grad = load(target, i * width + c)
                 store(target, i * width + c, grad * value * (ONE - value))
-    return found != ZERO
+    return any_lane(select(total <= ZERO, splat(ZERO), splat(ONE)) > ZERO)  # nan is not zero
 
 
 @inner
@@ -218,6 +224,8 @@ def mlp_backward(  # type: ignore[no-untyped-def]
         set_zero(common, 0, (last - first) * hidden)
         work = empty(BLOCK * max(layers.shared_pad, widest), float32)
         current, other = empty(BLOCK * widest, float32), empty(BLOCK * widest, float32)
+        zeros = empty(widest, float32)
+        set_zero(zeros, 0, widest)
         for row in range(starts[first], starts[last], BLOCK):
             count = min(BLOCK, starts[last] - row)
             d, before = current, other
@@ -225,16 +233,20 @@ def mlp_backward(  # type: ignore[no-untyped-def]
                 continue
             for layer in range(depth - 1, -1, -1):
                 inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
+                left = (work, 0, inputs)
                 if layer == 0:
                     _copy_rows(x, row, layers.inputs, work, inputs, count)
                 else:
-                    for i in range(count):
-                        at = (row + i) * layers.row + layers.hidden[layer - 1]
-                        for c in range(0, inputs, LANES):
-                            store(work, i * inputs + c, load(acts, at + c))
-                    set_zero(work, count * inputs, BLOCK * inputs)
+                    kept = _kept(layers, acts, starts[-1], layer - 1, row)
+                    if count == BLOCK:
+                        left = kept
+                    else:
+                        for i in range(0, count * inputs, LANES):
+                            store(work, i, load(acts, kept[1] + i))
+                        set_zero(work, count * inputs, BLOCK * inputs)
+                turned = (left[0], left[1], 1, inputs)
                 into = (part, layers.matrix[layer], outputs)
-                product((work, 0, 1, inputs), (d, 0, outputs), into, into, inputs, outputs, BLOCK)
+                product(turned, (d, 0, outputs), into, into, inputs, outputs, BLOCK)
                 if layer:
                     _column_sums(d, outputs, part, layers.bias[layer])
                 else:
@@ -243,13 +255,13 @@ def mlp_backward(  # type: ignore[no-untyped-def]
                         for c in range(0, hidden, LANES):
                             total = load(common, place + c) + load(d, i * hidden + c)
                             store(common, place + c, total)
-                set_zero(before, 0, BLOCK * inputs)
-                back, rows = (weights, layers.transposed[layer], inputs), (before, 0, inputs)
-                product((d, 0, outputs, 1), back, rows, rows, BLOCK, inputs, outputs)
+                back = (weights, layers.transposed[layer], inputs)
+                nothing, rows = (zeros, 0, 0), (before, 0, inputs)
+                product((d, 0, outputs, 1), back, nothing, rows, BLOCK, inputs, outputs)
                 if layer:
                     zero = splat(ZERO)
                     for i in range(0, BLOCK * inputs, LANES):
-                        value = select(zero < load(work, i), load(before, i), zero)
+                        value = select(zero < load(left[0], left[1] + i), load(before, i), zero)
                         store(before, i, value)
                 d, before = before, d
             width = layers.widths[0]

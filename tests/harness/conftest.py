@@ -19,6 +19,7 @@ from chronoscene.harness.files.records import read_run
 from chronoscene.harness.plan.settings import bench_settings
 from chronoscene.harness.run.process import run_in_process
 from chronoscene.harness.run.runner import BenchOutcome, run_bench
+from chronoscene.images.truth import GEOMETRY, truth_place
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 
 PLUGINS = Path(__file__).parent / "plugins"
@@ -115,6 +116,29 @@ def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "ring", root, root / "photos", frames, make_points(frames), periods, "made up", "memory"
     )
     return scene_format.write(scene, root / "ring")
+
+
+@pytest.fixture(scope="session")
+def write_truth() -> Callable[[Scene, Path], Path]:
+    """Writer of what the test cameras of the ring would see at the other period, in noise."""
+
+    def write(scene: Scene, folder: Path) -> Path:
+        rng = np.random.default_rng(0)
+        for frame in scene.select(split="test"):
+            other = 1 - frame.period
+            image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+            changes = np.zeros((HEIGHT, WIDTH), np.uint8)
+            changes[:, :9] = GEOMETRY
+            for kind, array in (("cross_rgb", image), ("change", changes)):
+                path = folder / truth_place(kind, frame.name, other)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                Image.fromarray(array).save(path)
+            path = folder / truth_place("depth", frame.name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(path, depth=np.full((HEIGHT, WIDTH), 3.0, np.float32))
+        return folder
+
+    return write
 
 
 @pytest.fixture(scope="session", autouse=True)

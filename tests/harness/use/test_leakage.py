@@ -188,22 +188,8 @@ def run(trained):
 
 
 @pytest.fixture
-def truth(run, tmp_path):
-    """What the test cameras of the ring would see at the other period, in noise."""
-    rng = np.random.default_rng(0)
-    for frame in run.scene().select(split="test"):
-        other = 1 - frame.period
-        image = rng.integers(0, 256, (16, 24, 3), dtype=np.uint8)
-        changes = np.zeros((16, 24), np.uint8)
-        changes[:, :9] = GEOMETRY
-        for kind, array in (("cross_rgb", image), ("change", changes)):
-            path = tmp_path / "gt" / truth_place(kind, frame.name, other)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(array).save(path)
-        path = tmp_path / "gt" / truth_place("depth", frame.name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(path, depth=np.full((16, 24), 3.0, np.float32))
-    return tmp_path / "gt"
+def truth(run, write_truth, tmp_path):
+    return write_truth(run.scene(), tmp_path / "gt")
 
 
 def leakage(*arguments):
