@@ -75,6 +75,10 @@ NERF_W = MethodSpec(
     presets=_presets({"appearance": "image", "transient": "density"}),
     **_COMMON,
 )
+# Where the content changes with the time, the weight of the paper lets the transient head take all.
+_W_T: dict[str, Any] = {
+    "appearance": "image", "transient": "density", "time": "frequencies", "transient_weight": 1.0,
+}  # fmt: skip
 NERF_W_T = MethodSpec(
     name="nerf-w-t",
     title="NeRF-W-T",
@@ -82,7 +86,7 @@ NERF_W_T = MethodSpec(
     licence="Apache-2.0",
     period_input="continuous",
     method="baselines.nerf.method:NerfWT",
-    presets=_presets({"appearance": "image", "transient": "density", "time": "frequencies"}),
+    presets=_presets(_W_T),
     **_COMMON,
 )
 _HA: dict[str, Any] = {"appearance": "encoder", "transient": "mask"}

@@ -38,7 +38,7 @@ from chronoscene.training.periods import period_weights
 
 _FIRST_RAYS, _FEWEST_RAYS = 256, 64
 _PIXELS_PER_RAY = 64
-_RENDERED_RAYS = 2_048  # At a time
+_RENDERED_RAYS = 8_192  # At a time; each level of a grid is read once for all of them
 _AT_A_TIME = 16  # Samples of a ray that are evaluated before it is asked whether it goes on
 _OPAQUE = 0.1 - math.log(STOP)  # Optical depth; not the exact one, which is rounded elsewhere
 _STREAM = 1_000  # Number of the random draws of a step, after the seed
