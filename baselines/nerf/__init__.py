@@ -77,7 +77,7 @@ NERF_W = MethodSpec(
 )
 # Where the content changes with the time, the weight of the paper lets the transient head take all.
 _W_T: dict[str, Any] = {
-    "appearance": "image", "transient": "density", "time": "frequencies", "transient_weight": 1.0,
+    "appearance": "image", "transient": "density", "time": "frequencies", "transient_weight": 3.0,
 }  # fmt: skip
 NERF_W_T = MethodSpec(
     name="nerf-w-t",
