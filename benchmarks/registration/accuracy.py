@@ -85,16 +85,16 @@ FAMILIES: dict[str, Callable[[np.random.Generator], dict[str, object]]] = {
         "ties": int(rng.integers(200, 1000)), "scale": _log_uniform(rng, 5e-4, 0.05)
     },
     "forward-facing": lambda rng: {
-        "ties": int(_log_uniform(rng, 60, 1000)), "arc": _log_uniform(rng, 6, 30)
+        "ties": int(_log_uniform(rng, 60, 1000)), "arc": _log_uniform(rng, 10, 40)
     },
     "forward-facing, an error": lambda rng: {
-        "ties": int(rng.integers(100, 1000)), "arc": _log_uniform(rng, 6, 30),
+        "ties": int(rng.integers(100, 1000)), "arc": _log_uniform(rng, 10, 40),
         "rotation": _log_uniform(rng, 0.02, 0.5), "shift": _log_uniform(rng, 0.01, 1),
         "scale": _log_uniform(rng, 5e-4, 0.02),
     },
     "forward-facing, repeated structure": lambda rng: {
-        "ties": int(rng.integers(100, 800)), "arc": _log_uniform(rng, 6, 30),
-        "repeated": rng.uniform(0.15, 1.0), "step": _log_uniform(rng, 0.3, 8),
+        "ties": int(rng.integers(100, 800)), "arc": _log_uniform(rng, 10, 40),
+        "repeated": rng.uniform(0.15, 1.0), "step": _log_uniform(rng, 1, 10),
     },
 }  # fmt: skip
 """Families of errors, as changes of `CaseSettings`."""

@@ -1,10 +1,11 @@
 """Registrations whose truth is known, without images: to calibrate the verdict, and to test it.
 
-A city of boxes is seen by rings of cameras at every date, or from one side. Observations are projections with noise;
-each period is a model of its own in a frame of its own, and is brought to the first period by what
-matches between them, as the route ``separate`` does. What can go wrong there can be asked for: few
-matches, matches in one spot, matches of repeated structure that agree with each other and are all
-wrong, gross outliers, a period deformed by drift, alignment by GPS alone, or a plain error.
+A city of boxes is seen by rings of cameras at every date, or from one side. Observations are
+projections with noise; each period is a model of its own in a frame of its own, and is brought to
+the first period by what matches between them, as the route ``separate`` does. What can go wrong
+there can be asked for: few matches, matches in one spot, matches of repeated structure that agree
+with each other and are all wrong, gross outliers, a period deformed by drift, alignment by GPS
+alone, or a plain error.
 """
 
 from __future__ import annotations
