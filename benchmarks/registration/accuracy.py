@@ -1,6 +1,7 @@
 """Registrations of known truth: errors of poses by period, and whether the verdict can be trusted.
 
     python -m benchmarks.registration.accuracy observations [--cases 300] [--seed 0] [--only FAMILY]
+        [--save FILE] [--before FILE]
     python -m benchmarks.registration.accuracy images [--only NAME] [--work FOLDER] [--route joint]
     python -m benchmarks.registration.accuracy photos FOLDER... [--work FOLDER] [--route joint]
 
@@ -29,7 +30,7 @@ import numpy as np
 
 from benchmarks.registration.generated import CaseSettings, generate_case
 from benchmarks.registration.images import run_images
-from benchmarks.registration.outcomes import REFUSED, Outcome, judged
+from benchmarks.registration.outcomes import REFUSED, Outcome, judged, load, save
 from benchmarks.registration.photos import run_photos
 from chronoscene.harness.files.provenance import processor_name
 from chronoscene.registration.quality.certificate import certify
@@ -139,6 +140,26 @@ def confusion(outcomes: list[Outcome]) -> str:
     return "\n".join(lines)
 
 
+def compare(before: list[Outcome], after: list[Outcome]) -> str:
+    """Verdicts of two versions on the same cases, as a table of Markdown."""
+    heads = " | ".join(f"{level}, {when}" for level in LEVELS for when in ("before", "after"))
+    lines = [f"| | {heads} |", "| --- |" + " ---: |" * 2 * len(LEVELS)]
+    for family in ["all", *dict.fromkeys(o.family for o in after)]:
+        for right in (True, False):
+            pairs = [
+                (one.verdict, other.verdict)
+                for one, other in zip(before, after, strict=True)
+                if other.right == right and family in ("all", other.family)
+            ]
+            counts = (
+                str(sum(pair[i] == level for pair in pairs)) for level in LEVELS for i in (0, 1)
+            )
+            if pairs:
+                name = f"{family}, {'right' if right else 'wrong'}"
+                lines.append(f"| {name} | {' | '.join(counts)} |")
+    return "\n".join(lines)
+
+
 def errors_table(outcomes: list[Outcome]) -> str:
     """Median over the cases of each family and route, worst period of each case."""
     lines = [f"{'':<40}{'':<10}{'rotation [deg]':>20}{'centre [% extent]':>20}{'CPU [s]':>9}"]
@@ -165,6 +186,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="families or cases whose name has this in it")
     parser.add_argument("--route", default="all", help="one of the routes, or all")
     parser.add_argument("--work", type=Path, help="folder that keeps scenes and models")
+    parser.add_argument("--save", type=Path, help="file that keeps the outcomes")
+    parser.add_argument("--before", type=Path, help="--save of another version, to compare with")
     options = parser.parse_args()
     print(f"{processor_name()}, {os.cpu_count()} processors, seed {options.seed}")
     if options.tier == "observations":
@@ -173,6 +196,10 @@ def main() -> None:
         outcomes = run_photos(options)
     else:
         outcomes = run_images(options)
+    if options.save is not None:
+        save(outcomes, options.save)
+    if options.before is not None:
+        print("\n" + compare(load(options.before), outcomes))
     print("\n" + errors_table(outcomes))
     if options.tier == "photos":  # what they are compared with is no truth
         return

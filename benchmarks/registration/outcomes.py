@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,16 @@ def judged(
 def refused(family: str, route: str, periods: int, seconds: float) -> Outcome:
     """A command that ended with a message instead of a registration."""
     return Outcome(family, route, ((np.inf,) * 4,) * (periods - 1), REFUSED, "", seconds)
+
+
+def save(outcomes: list[Outcome], file: Path) -> None:
+    """Write outcomes, for a comparison with those of another version."""
+    file.write_text(json.dumps([asdict(o) for o in outcomes], indent=0) + "\n", encoding="utf-8")
+
+
+def load(file: Path) -> list[Outcome]:
+    """Read what `save` wrote."""
+    return [Outcome(**row) for row in json.loads(file.read_text(encoding="utf-8"))]
 
 
 def true_extent(truth: np.ndarray) -> float:

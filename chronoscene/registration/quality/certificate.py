@@ -162,15 +162,21 @@ def certify(model: Registered) -> Certificate:
 def scene_extent(model: Registered) -> float:
     """Diagonal of the box around the cameras; at least the median depth of what they see.
 
+    It is also at least a tenth of the diagonal of the points.
+
     Cameras that look one way from nearly one place move what they see by that share of its depth,
     in the images and along the view, however close to each other they are.
     """
     size = 0.0
+    if len(model.points):
+        low, high = np.percentile(model.points, [5, 95], axis=0)
+        size = 0.1 * float(np.linalg.norm(high - low))
     rows = slice(None, None, len(model.track_image) // MAX_OBSERVATIONS + 1)
     along = model.cam_from_world[model.track_image[rows], 2]
     points = model.points[track_owners(model.track_start)[rows]]
     if len(points):
-        size = float(np.median((along[:, :3] * points).sum(axis=1) + along[:, 3]))
+        depth = (along[:, :3] * points).sum(axis=1) + along[:, 3]
+        size = max(size, float(np.median(depth)))
     if len(model.names):
         centres = camera_centre(model.cam_from_world)
         size = max(size, float(np.linalg.norm(np.ptp(centres, axis=0))))

@@ -133,7 +133,7 @@ THRESHOLDS: dict[str, Threshold] = {
     ),
     "localised": Threshold(
         what="pose error of images localised from the other period, beyond its noise",
-        unit="times 0.1 degrees or 0.2%", doubtful=0.6, fail=10.0,
+        unit="times 0.1 degrees or 0.2%", doubtful=0.75, fail=10.0,
         why="the points of each period must place the images of the other correctly",
         todo=_LOOK,
     ),
@@ -142,6 +142,13 @@ THRESHOLDS: dict[str, Threshold] = {
         unit="% of extent", doubtful=0.15,
         why="surfaces are compared without matches, so repeated structure shows here; but a beach "
         "or a quarry may really have moved",
+        todo=_LOOK,
+    ),
+    "open": Threshold(
+        what="shift between the surfaces of two periods that is not ruled out",
+        unit="% of extent", doubtful=0.75,
+        why="matches of repeated structure agree with each other wherever they lead; surfaces must "
+        "exclude its steps",
         todo=_LOOK,
     ),
     "surfaces": Threshold(
@@ -342,6 +349,7 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
         shift = pair.surfaces.shift
         if shift.low > 0:
             yield from _check("clouds", 100 * shift.value / certificate.extent, place)
+        yield from _check("open", 100 * shift.high / certificate.extent, place)
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
