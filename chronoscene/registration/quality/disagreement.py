@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chronoscene.arrays import Array, Mask
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.registration.quality.misalignment import Transfers
 from chronoscene.registration.quality.rays import PlacedPoints
 
@@ -64,7 +64,7 @@ def _step(gaps: Array, spread: Array) -> float:
     return float((same.sum(axis=1).max() - 1) / (len(gaps) - 1))
 
 
-def _images(image: Array, disagrees: Mask) -> float:
+def _images(image: Ints, disagrees: Mask) -> float:
     """Share of the disagreeing observations in images with many more than usual. [O], [O]"""
     total, bad = np.bincount(image), np.bincount(image[disagrees], minlength=image.max() + 1)
     usual = disagrees.mean()

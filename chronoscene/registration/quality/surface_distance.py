@@ -102,8 +102,8 @@ def surface_distance(
     if like is None:
         return found
     facing = np.einsum("ni,nij->nj", normal, generators(mean - like.middle))
-    step, covariance = _solve(distance, facing, chance)
-    return replace(found, motion=replace(like, step=step, covariance=covariance))
+    motion, covariance = _solve(distance, facing, chance)
+    return replace(found, motion=replace(like, step=motion, covariance=covariance))
 
 
 def _planes(patches: Array) -> tuple[Array, Array, Array]:

@@ -402,10 +402,8 @@ def test_a_forward_facing_capture_is_measured_by_its_depth() -> None:
     certificate = certify(generate_case(case).model)
     assert 80 < certificate.extent < 130
     assert judge(certificate).level == "pass"
-    for error in ({"scale": 0.01}, {"rotation": 0.3}, {"shift": 0.6}):
-        wrong = generate_case(replace(case, **error))
-        verdict = judge(certify(wrong.model))
-        assert verdict.level == "fail", error
+    for wrong in (replace(case, scale=0.01), replace(case, rotation=0.3), replace(case, shift=0.6)):
+        assert judge(certify(generate_case(wrong).model)).level == "fail"
 
 
 def test_the_documented_thresholds_are_those_of_the_code() -> None:

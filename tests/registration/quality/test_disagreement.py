@@ -17,7 +17,7 @@ def test_gaps_of_one_step_are_told_from_scattered_ones() -> None:
     scattered = rng.normal(0, 1.0, (30, 3))
     assert _step(scattered, spread) == 0
     together = scattered.copy()
-    together[:16] = [0.5, 0.2, 0.0] + rng.normal(0, 0.01, (16, 3))
+    together[:16] = rng.normal([0.5, 0.2, 0.0], 0.01, (16, 3))
     assert _step(together, spread) == pytest.approx(15 / 29, abs=0.07)
     assert _step(together[:3], spread[:3]) == 0  # too few to tell
 
