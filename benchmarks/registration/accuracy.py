@@ -12,9 +12,11 @@ by each of its routes. ``photos`` takes real photos, deals them into periods, an
 one reconstruction of all of them.
 
 A registration is right if the median rotation of every period is within 0.1 degrees and its median
-centre within 0.2% of the scene's extent, in the frame of the first period's cameras. The confusion
-table sets that against the verdict. The exit status is 1 if a wrong registration was passed.
-Photos have no truth, so there is no such table for them.
+centre within 0.2% of the scene's extent, in the frame of the first period's cameras. The extent is
+that of the cameras, or the median depth of points if that is larger, and the depth of points may
+not change by more either. The confusion table sets that against the verdict; ``--before`` compares
+it with outcomes of another version. The exit status is 1 if a wrong registration was passed. Photos
+have no truth, so there is no such table for them.
 """
 
 from __future__ import annotations
