@@ -127,6 +127,8 @@ class Certificate:
     """All pairs of periods, earlier first."""
     evidence: Evidence
     """Observations on which the figures are measured."""
+    facing: bool = False
+    """True if the extent is a depth: cameras look one way from nearly one place."""
     features: str = METHOD
     """Name of the features and matches that it was made with."""
     resection: Resection | None = None
@@ -148,6 +150,7 @@ def certify(model: Registered) -> Certificate:
         resection=model.resection,
         unit=model.unit,
         extent=extent,
+        facing=_span(model) < extent,
         focal=float(np.median(focals)) if focals else float("nan"),
         labels=tuple(model.labels),
         periods=tuple(_period(model, evidence, p) for p in range(model.num_periods)),
@@ -177,10 +180,14 @@ def scene_extent(model: Registered) -> float:
     if len(points):
         depth = (along[:, :3] * points).sum(axis=1) + along[:, 3]
         size = max(size, float(np.median(depth)))
-    if len(model.names):
-        centres = camera_centre(model.cam_from_world)
-        size = max(size, float(np.linalg.norm(np.ptp(centres, axis=0))))
-    return size
+    return max(size, _span(model))
+
+
+def _span(model: Registered) -> float:
+    """Diagonal of the box around the cameras."""
+    if not len(model.names):
+        return 0.0
+    return float(np.linalg.norm(np.ptp(camera_centre(model.cam_from_world), axis=0)))
 
 
 def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures:

@@ -133,7 +133,7 @@ THRESHOLDS: dict[str, Threshold] = {
     ),
     "localised": Threshold(
         what="pose error of images localised from the other period, beyond its noise",
-        unit="times 0.1 degrees or 0.2%", doubtful=0.75, fail=10.0,
+        unit="times 0.1 degrees or 0.2%", doubtful=0.6, fail=10.0,
         why="the points of each period must place the images of the other correctly",
         todo=_LOOK,
     ),
@@ -193,7 +193,9 @@ FITTED = 1.3
 
 FEW_TRACKS = 4  # Held-out tracks that support other evidence where they are too few to measure
 FEW_AGREEING = 0.5  # Share of their observations that agrees
-CERTAIN = 1.5  # Errors of localised images count up to so many times their lower bound
+FACING = 0.8
+"""Share of the error of localised images that counts in forward-facing captures: turns and shifts
+of a camera make up for each other there."""
 MARGIN = 0.8  # Of the limits, within which an interval must end that other evidence confirms
 
 MIN_TIES = 3  # Tie points, clicked ones for example, that two periods need to be linked
@@ -344,7 +346,7 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
     yield from _check("tied", min(pair.ties.tied_a, pair.ties.tied_b), place)
     for found in (pair.localised_b, pair.localised_a):
         if isinstance(found, Localisation) and found.images >= 3:
-            yield from _check("localised", _localised(found, certificate.extent), place)
+            yield from _check("localised", _localised(found, certificate), place)
     if isinstance(pair.surfaces, SurfaceDistance):
         shift = pair.surfaces.shift
         if shift.low > 0:
@@ -353,22 +355,17 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
-def _localised(found: Localisation, extent: float) -> float:
-    """The larger of both errors against its limit; it fails only as far as it is certain.
-
-    An error whose lower bound is a small part of it is noise of few images.
-    """
+def _localised(found: Localisation, certificate: Certificate) -> float:
+    """The larger of both errors against its limit; it fails only as far as it is certain."""
+    turn, place = found.rotation_excess, found.centre_excess
+    share = FACING if certificate.facing else 1.0
+    likely, certain = (
+        share * max(r / _limit("rotation"), 100 * c / certificate.extent / _limit("shift"))
+        for r, c in ((turn.value, place.value), (turn.low, place.low))
+    )
     bad = THRESHOLDS["localised"].fail
     assert bad is not None
-    errors = [
-        (excess.value * factor, excess.low * factor)
-        for excess, factor in (
-            (found.rotation_excess, 1 / _limit("rotation")),
-            (found.centre_excess, 100 / extent / _limit("shift")),
-        )
-    ]
-    certain = max(low for _, low in errors)
-    return certain if certain > bad else max(min(x, CERTAIN * low, bad) for x, low in errors)
+    return certain if certain > bad else min(likely, bad)
 
 
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:

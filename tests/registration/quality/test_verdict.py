@@ -218,15 +218,17 @@ LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
     "tied, second": ("tied", "doubtful", lambda c, x: with_part(c, "ties", tied_b=x), 0.501, 0.499),
     "localised, first, rotation": (
         "localised", "doubtful",
-        lambda c, x: with_part(c, "localised_a", rotation_excess=Excess(x, x)), 0.0749, 0.0751,
+        lambda c, x: with_part(c, "localised_a", rotation_excess=Excess(x, 0.0)), 0.0599, 0.0601,
     ),
     "localised, second, centre": (
         "localised", "doubtful",
-        lambda c, x: with_part(c, "localised_b", centre_excess=Excess(x, x)), 0.0749, 0.0751,
+        lambda c, x: with_part(c, "localised_b", centre_excess=Excess(x, 0.0)), 0.0599, 0.0601,
     ),
-    "localised, lower bound": (
+    "localised, forward-facing": (
         "localised", "doubtful",
-        lambda c, x: with_part(c, "localised_b", rotation_excess=Excess(0.3, x)), 0.0499, 0.0501,
+        lambda c, x: with_part(
+            replace(c, facing=True), "localised_b", centre_excess=Excess(x, 0.0)
+        ), 0.0749, 0.0751,
     ),
     "localised, rotation, fail": (
         "localised", "fail",
