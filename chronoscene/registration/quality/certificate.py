@@ -85,7 +85,7 @@ class HeldOut:
     """Median distance to the epipolar lines, pixels."""
     matches: int
     disagreement: Disagreement = field(default_factory=Disagreement)
-    """Of the other observations."""
+    """Order in the other observations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,9 +29,9 @@ class Disagreement:
     """Shares between 0, scattered, and 1, together."""
 
     step: float = 0.0
-    """Of the disagreeing tracks, those that one step in space explains."""
+    """Part of the disagreeing tracks that one step in space explains."""
     images: float = 0.0
-    """Of the disagreeing observations, those in images where they gather."""
+    """Part of the disagreeing observations in images where they gather."""
 
 
 def disagreement(
@@ -43,7 +43,7 @@ def disagreement(
         moved: Observations between two periods.
         disagrees: Those that do not fit. [O]
         placed: Points by either of the periods.
-        noise: Of an observation, pixels.
+        noise: Deviation of an observation, pixels.
     """
     a, b = placed
     found, slot = b.find(a.track)
