@@ -505,9 +505,9 @@ def _bounds(certificate: Certificate, pairs: list[tuple[int, int]]) -> Array:
         if (pair.a, pair.b) in pairs:
             weights[pair.a, pair.b] = 1e6
             if isinstance(pair.by_all, Misalignment):
-                turn, shift = _precise(pair)
-                moved = 100 * shift.high / certificate.extent / _limit("shift")
-                worst = max(turn.high / _limit("rotation"), moved, 1e-3)
+                # By ties alone: errors of surfaces are not independent from link to link.
+                shift = 100 * pair.by_all.shift.high / certificate.extent / _limit("shift")
+                worst = max(pair.by_all.rotation.high / _limit("rotation"), shift, 1e-3)
                 weights[pair.a, pair.b] = worst**2
     return np.asarray(np.sqrt(shortest_path(csr_array(weights), directed=False)))
 
