@@ -426,6 +426,8 @@ def _confirmed(certificate: Certificate, pair: PairFigures) -> bool:
     held, surfaces = pair.held_out, pair.surfaces
     if isinstance(pair.by_all, str) or isinstance(surfaces, str) or isinstance(held, str):
         return False
+    if isinstance(pair.misalignment, Misalignment) and pair.independent is None:
+        return False  # Surfaces contradict the held-out tracks
     local = (pair.localised_a, pair.localised_b)
     percent = 100 / certificate.extent
     turn, shift = _precise(pair)
