@@ -375,7 +375,8 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
     They are aligned if the interval of the precise measurement (all ties, and the surfaces) ends
     below the limit, and an independent one (held-out tracks, and the surfaces) agrees: its interval
     ends below the limit, or its estimate lies below it and its interval ends below twice the limit.
-    Where it is wider, surfaces must confirm a precise measurement with a margin.
+    Where it is wider, with its estimate below the limit, surfaces must confirm a precise
+    measurement with a margin.
     """
     held, by_all = pair.misalignment, pair.by_all
     confirmed = _confirmed(certificate, pair)
@@ -395,8 +396,8 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
         if pair.independent is not None:
             one = min(one, pair.independent[i], key=lambda x: x.high)
         loose, estimate = one.high * factor, one.value * factor
-        wide = loose > limit and (estimate > limit or loose > 2 * limit)
-        if high > limit or (wide and not confirmed):
+        beyond = loose > limit and estimate > limit  # Nothing confirms what this contradicts
+        if high > limit or beyond or (loose > 2 * limit and not confirmed):
             t = THRESHOLDS[key]
             found = (
                 f"{t.what}: {estimate:.3g} {t.unit}, but up to {max(high, loose):.3g} cannot be "
