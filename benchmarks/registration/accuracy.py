@@ -1,6 +1,7 @@
 """Registrations of known truth: errors of poses by period, and whether the verdict can be trusted.
 
     python -m benchmarks.registration.accuracy observations [--cases 300] [--seed 0] [--only FAMILY]
+        [--save FILE] [--before FILE]
     python -m benchmarks.registration.accuracy images [--only NAME] [--work FOLDER] [--route joint]
     python -m benchmarks.registration.accuracy photos FOLDER... [--work FOLDER] [--route joint]
 
@@ -11,9 +12,11 @@ by each of its routes. ``photos`` takes real photos, deals them into periods, an
 one reconstruction of all of them.
 
 A registration is right if the median rotation of every period is within 0.1 degrees and its median
-centre within 0.2% of the scene's extent, in the frame of the first period's cameras. The confusion
-table sets that against the verdict. The exit status is 1 if a wrong registration was passed.
-Photos have no truth, so there is no such table for them.
+centre within 0.2% of the scene's extent, in the frame of the first period's cameras. The extent is
+that of the cameras, or the median depth of points if that is larger, and the depth of points may
+not change by more either. The confusion table sets that against the verdict; ``--before`` compares
+it with outcomes of another version. The exit status is 1 if a wrong registration was passed. Photos
+have no truth, so there is no such table for them.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ import numpy as np
 
 from benchmarks.registration.generated import CaseSettings, generate_case
 from benchmarks.registration.images import run_images
-from benchmarks.registration.outcomes import REFUSED, Outcome, judged
+from benchmarks.registration.outcomes import REFUSED, Outcome, judged, load, save
 from benchmarks.registration.photos import run_photos
 from chronoscene.harness.files.provenance import processor_name
 from chronoscene.registration.quality.certificate import certify
@@ -63,7 +66,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator], dict[str, object]]] = {
         "ties": int(rng.integers(200, 800)), "outliers": rng.uniform(0.2, 0.7)
     },
     "repeated structure": lambda rng: {
-        "ties": int(rng.integers(100, 800)), "repeated": rng.uniform(0.5, 1.0),
+        "ties": int(rng.integers(100, 800)), "repeated": rng.uniform(0.15, 1.0),
         "step": _log_uniform(rng, 0.6, 15), "cluster": None if rng.random() < 0.5 else 25.0,
     },
     "a little wrong": lambda rng: {
@@ -83,6 +86,18 @@ FAMILIES: dict[str, Callable[[np.random.Generator], dict[str, object]]] = {
     },
     "drift in scale": lambda rng: {
         "ties": int(rng.integers(200, 1000)), "scale": _log_uniform(rng, 5e-4, 0.05)
+    },
+    "forward-facing": lambda rng: {
+        "ties": int(_log_uniform(rng, 60, 1000)), "arc": _log_uniform(rng, 10, 40)
+    },
+    "forward-facing, an error": lambda rng: {
+        "ties": int(rng.integers(100, 1000)), "arc": _log_uniform(rng, 10, 40),
+        "rotation": _log_uniform(rng, 0.02, 0.5), "shift": _log_uniform(rng, 0.01, 1),
+        "scale": _log_uniform(rng, 5e-4, 0.02),
+    },
+    "forward-facing, repeated structure": lambda rng: {
+        "ties": int(rng.integers(100, 800)), "arc": _log_uniform(rng, 10, 40),
+        "repeated": rng.uniform(0.15, 1.0), "step": _log_uniform(rng, 1, 10),
     },
 }  # fmt: skip
 """Families of errors, as changes of `CaseSettings`."""
@@ -127,6 +142,26 @@ def confusion(outcomes: list[Outcome]) -> str:
     return "\n".join(lines)
 
 
+def compare(before: list[Outcome], after: list[Outcome]) -> str:
+    """Verdicts of two versions on the same cases, as a table of Markdown."""
+    heads = " | ".join(f"{level}, {when}" for level in LEVELS for when in ("before", "after"))
+    lines = [f"| | {heads} |", "| --- |" + " ---: |" * 2 * len(LEVELS)]
+    for family in ["all", *dict.fromkeys(o.family for o in after)]:
+        for right in (True, False):
+            pairs = [
+                (one.verdict, other.verdict)
+                for one, other in zip(before, after, strict=True)
+                if other.right == right and family in ("all", other.family)
+            ]
+            counts = (
+                str(sum(pair[i] == level for pair in pairs)) for level in LEVELS for i in (0, 1)
+            )
+            if pairs:
+                name = f"{family}, {'right' if right else 'wrong'}"
+                lines.append(f"| {name} | {' | '.join(counts)} |")
+    return "\n".join(lines)
+
+
 def errors_table(outcomes: list[Outcome]) -> str:
     """Median over the cases of each family and route, worst period of each case."""
     lines = [f"{'':<40}{'':<10}{'rotation [deg]':>20}{'centre [% extent]':>20}{'CPU [s]':>9}"]
@@ -153,6 +188,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="families or cases whose name has this in it")
     parser.add_argument("--route", default="all", help="one of the routes, or all")
     parser.add_argument("--work", type=Path, help="folder that keeps scenes and models")
+    parser.add_argument("--save", type=Path, help="file that keeps the outcomes")
+    parser.add_argument("--before", type=Path, help="--save of another version, to compare with")
     options = parser.parse_args()
     print(f"{processor_name()}, {os.cpu_count()} processors, seed {options.seed}")
     if options.tier == "observations":
@@ -161,6 +198,10 @@ def main() -> None:
         outcomes = run_photos(options)
     else:
         outcomes = run_images(options)
+    if options.save is not None:
+        save(outcomes, options.save)
+    if options.before is not None:
+        print("\n" + compare(load(options.before), outcomes))
     print("\n" + errors_table(outcomes))
     if options.tier == "photos":  # what they are compared with is no truth
         return

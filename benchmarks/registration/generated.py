@@ -1,10 +1,11 @@
 """Registrations whose truth is known, without images: to calibrate the verdict, and to test it.
 
-A city of boxes is seen by rings of cameras at every date. Observations are projections with noise;
-each period is a model of its own in a frame of its own, and is brought to the first period by what
-matches between them, as the route ``separate`` does. What can go wrong there can be asked for: few
-matches, matches in one spot, matches of repeated structure that agree with each other and are all
-wrong, gross outliers, a period deformed by drift, alignment by GPS alone, or a plain error.
+A city of boxes is seen by rings of cameras at every date, or from one side. Observations are
+projections with noise; each period is a model of its own in a frame of its own, and is brought to
+the first period by what matches between them, as the route ``separate`` does. What can go wrong
+there can be asked for: few matches, matches in one spot, matches of repeated structure that agree
+with each other and are all wrong, gross outliers, a period deformed by drift, alignment by GPS
+alone, or a plain error.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ class CaseSettings:
     """Further points of each period alone, as a share of them."""
     ties: int = 300
     """Points matched between a period and the first one (or the one before, in a chain)."""
+    arc: float | None = None
+    """Length of the arc on which cameras stand beside the city; None for a ring around it."""
     chain: bool = False
     """True if a period matches only the one before it."""
     cluster: float | None = None
@@ -98,12 +101,14 @@ def generate_case(settings: CaseSettings) -> Generated:
     rng = np.random.default_rng(settings.seed)
     stable = _city(rng, settings.points)
     tied = _tied(rng, settings, stable)
-    truth = np.concatenate([_ring(rng, settings.views) for _ in range(settings.periods)])
+    truth = np.concatenate([_cameras(rng, settings) for _ in range(settings.periods)])
     periods = np.repeat(np.arange(settings.periods), settings.views)
     sightings, of_two = _observe(rng, settings, stable, tied, truth, periods)
     out = of_two & (rng.random(len(of_two)) < settings.held_out)
     gps = _gps(rng, settings, camera_centre(truth), periods)
-    poses = _domed(_jittered(rng, truth), truth, periods, stable, settings.doming)
+    # The errors of a bundle adjustment shrink with the baselines, as points determine both.
+    precision = 1.0 if settings.arc is None else settings.arc / SIDE
+    poses = _domed(_jittered(rng, truth, precision), truth, periods, stable, settings.doming)
     model = _empty(settings, poses, periods, gps)
     poses = _align(rng, settings, model, _part(sightings, ~out))
     model = replace(model, cam_from_world=poses)
@@ -175,11 +180,15 @@ def _tied(rng: np.random.Generator, settings: CaseSettings, points: Array) -> Ma
     return tied
 
 
-def _ring(rng: np.random.Generator, views: int) -> Array:
-    """Cameras around the city that look at places near its middle. [views, 4, 4]"""
+def _cameras(rng: np.random.Generator, settings: CaseSettings) -> Array:
+    """Cameras around the city, or on an arc, that look at places near its middle. [V, 4, 4]"""
+    views, arc = settings.views, settings.arc
     angle = 2 * np.pi * (np.arange(views) + rng.uniform(0, 1)) / views
     radius = rng.uniform(60, 80) + rng.normal(0, 4, views)
     height = rng.uniform(50, 75) + rng.normal(0, 4, views)
+    if arc is not None:
+        angle = arc / 90 * rng.uniform(-0.5, 0.5, views)
+        radius, height = 90 + rng.normal(0, 0.1 * arc, views), 45 + rng.normal(0, 0.1 * arc, views)
     centre = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
     target = np.column_stack([rng.normal(0, 8, (views, 2)), np.zeros(views)])
     forward = target - centre
@@ -246,13 +255,20 @@ def _part(sightings: _Sightings, tracks: Mask) -> _Sightings:
     return _Sightings(sightings.track[keep], sightings.image[keep], sightings.xy[keep])
 
 
-def _jittered(rng: np.random.Generator, poses: Array) -> Array:
-    """Poses as a bundle adjustment leaves them: a hundredth of a degree and two centimetres off."""
+def _jittered(rng: np.random.Generator, poses: Array, precision: float) -> Array:
+    """Poses as a bundle adjustment leaves them: a hundredth of a degree and two centimetres off.
+
+    Args:
+        rng: Source of the errors.
+        poses: True ones. [N, 4, 4]
+        precision: Factor of both.
+    """
     from scipy.spatial.transform import Rotation
 
-    turn = Rotation.from_rotvec(np.radians(rng.normal(0, 0.01, (len(poses), 3)))).as_matrix()
+    turn = Rotation.from_rotvec(np.radians(rng.normal(0, 0.01 * precision, (len(poses), 3))))
+    turn = turn.as_matrix()
     out = poses.copy()
-    centre = camera_centre(poses) + rng.normal(0, 0.02, (len(poses), 3))
+    centre = camera_centre(poses) + rng.normal(0, 0.02 * precision, (len(poses), 3))
     out[:, :3, :3] = turn @ poses[:, :3, :3]
     out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], centre)
     return out
@@ -346,7 +362,7 @@ def _align(
             found = _random_frame(rng)
         poses[mine] = found.apply_to_pose(own)
         if b == last:
-            poses[mine] = _error(rng, settings).apply_to_pose(poses[mine])
+            poses[mine] = _error(rng, settings, poses[mine]).apply_to_pose(poses[mine])
     return poses
 
 
@@ -389,12 +405,18 @@ def replace_poses(rays: TrackRays, poses: Array) -> TrackRays:
     return replace(rays, pose=poses[rays.image])
 
 
-def _error(rng: np.random.Generator, settings: CaseSettings) -> Sim3:
+def _error(rng: np.random.Generator, settings: CaseSettings, poses: Array) -> Sim3:
+    """The error that was asked for, about the middle of the cameras where they stand on an arc."""
     from scipy.spatial.transform import Rotation
 
     axis, way = rng.normal(size=(2, 3))
     turn = Rotation.from_rotvec(np.radians(settings.rotation) * axis / np.linalg.norm(axis))
-    return Sim3(1 + settings.scale, turn.as_matrix(), settings.shift * way / np.linalg.norm(way))
+    grow, rotation = 1 + settings.scale, turn.as_matrix()
+    shift = settings.shift * way / np.linalg.norm(way)
+    if settings.arc is not None:  # so that a scale moves points and no camera
+        middle = camera_centre(poses).mean(axis=0)
+        shift = shift + middle - grow * rotation @ middle
+    return Sim3(grow, rotation, shift)
 
 
 def _with_tracks(model: Registered, seen: _Sightings, held: _Sightings) -> Registered:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from chronoscene.registration.pipeline import Options
 from chronoscene.registration.quality.verdict import Verdict
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.tracks import track_owners
 
 ROUTES = ("joint", "separate", "frozen")
 
@@ -34,7 +36,8 @@ class Outcome:
     route: str
     """Empty where there is no choice."""
     periods: tuple[tuple[float, float, float, float], ...]
-    """Rotation median and largest, degrees; centre median and largest, percent of the extent."""
+    """Rotation median and largest, degrees; centre median and largest, percent of the extent, where
+    the median is at least that of the depths of points, by the scale of the cameras."""
     verdict: str
     reason: str
     seconds: float
@@ -57,7 +60,9 @@ def judged(
     """Compare a registration with the truth [N, 4, 4], where that is known. [N]"""
     where = np.ones(len(truth), bool) if where is None else where
     rotation, centre = pose_errors(model.cam_from_world, truth, where & (model.periods == 0))
-    extent = true_extent(truth[where])
+    depth = true_depth(model, truth, where & (model.periods == 0))
+    extent = max(true_extent(truth[where]), depth)
+    first = _spread(model, truth, where & (model.periods == 0))
     rows = []
     for p in range(1, model.num_periods):
         mine = where & (model.periods == p)
@@ -65,7 +70,8 @@ def judged(
             rows.append((np.inf,) * 4)
             continue
         r, c = rotation[mine], 100 * centre[mine] / extent
-        rows.append((np.median(r), r.max(), np.median(c), c.max()))
+        deep = 100 * depth * abs(_spread(model, truth, mine) / first - 1) / extent
+        rows.append((np.median(r), r.max(), max(np.median(c), deep), max(c.max(), deep)))
     reason = verdict.objections[0].check if verdict.objections else ""
     return Outcome(family, route, tuple(rows), verdict.level, reason, seconds)
 
@@ -75,9 +81,39 @@ def refused(family: str, route: str, periods: int, seconds: float) -> Outcome:
     return Outcome(family, route, ((np.inf,) * 4,) * (periods - 1), REFUSED, "", seconds)
 
 
+def save(outcomes: list[Outcome], file: Path) -> None:
+    """Write outcomes, for a comparison with those of another version."""
+    file.write_text(json.dumps([asdict(o) for o in outcomes], indent=0) + "\n", encoding="utf-8")
+
+
+def load(file: Path) -> list[Outcome]:
+    """Read what `save` wrote."""
+    return [Outcome(**row) for row in json.loads(file.read_text(encoding="utf-8"))]
+
+
 def true_extent(truth: np.ndarray) -> float:
-    """Diagonal of the box around the true cameras."""
+    """Diagonal of the box around cameras."""
     return float(np.linalg.norm(np.ptp(camera_centre(truth), axis=0)))
+
+
+def true_depth(model: Registered, truth: np.ndarray, images: np.ndarray) -> float:
+    """Median distance along the view at which some images see points, in units of the truth."""
+    image = model.track_image
+    rows = np.flatnonzero(images[image])
+    point = model.points[track_owners(model.track_start)[rows]]
+    along = model.cam_from_world[image[rows], 2]
+    depth = (along[:, :3] * point).sum(axis=1) + along[:, 3]
+    size = true_extent(model.cam_from_world[images])
+    return float(np.median(depth) * true_extent(truth[images]) / size)
+
+
+def _spread(model: Registered, truth: np.ndarray, mine: np.ndarray) -> float:
+    """Scale of some cameras against the truth, by their distances from their middle."""
+    here, there = (
+        np.linalg.norm(c - c.mean(axis=0), axis=1)
+        for c in (camera_centre(p[mine]) for p in (model.cam_from_world, truth))
+    )
+    return float(np.median(here / there)) if mine.sum() > 1 else 1.0
 
 
 @contextmanager

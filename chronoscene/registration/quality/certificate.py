@@ -7,16 +7,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
 from chronoscene.arrays import Array, Mask
 from chronoscene.registration.features import METHOD
+from chronoscene.registration.quality.disagreement import Disagreement, disagreement
 from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
+    CORE,
+    Interval,
     Misalignment,
     Transfers,
     measure,
@@ -36,6 +39,7 @@ from chronoscene.registration.quality.rays import (
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.result import Registered, Resection
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.tracks import track_owners
 
 BADLY_PLACED = 4.0  # Pixels; transfers whose point is less certain than this are ignored
 AGREES = 3.0  # Pixels within which a held-out observation agrees with the registration
@@ -68,7 +72,8 @@ class HeldOut:
     """Pixels."""
     p90: float
     noise: float
-    """Median in units of what the placing of the point leaves open: pixels of one observation."""
+    """Median in units of what the placing of the point leaves open: pixels of one observation. Of
+    those that agree, if any do."""
     agreeing: float
     """Share within `AGREES` pixels, or three times what the placing of the point leaves open."""
     distance: float
@@ -79,6 +84,8 @@ class HeldOut:
     epipolar: float | None
     """Median distance to the epipolar lines, pixels."""
     matches: int
+    disagreement: Disagreement = field(default_factory=Disagreement)
+    """Order in the other observations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +104,10 @@ class PairFigures:
     """Images of b by the points of a."""
     localised_a: Localisation | str
     surfaces: SurfaceDistance | str
+    by_ties_and_surfaces: tuple[Interval, Interval] | None = None
+    """Rotation and displacement by `by_all` and the surfaces together."""
+    independent: tuple[Interval, Interval] | None = None
+    """By held-out tracks and the surfaces together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +118,7 @@ class Certificate:
     unit: str
     """``metre``, or ``unknown``: then distances mean something as shares of the extent only."""
     extent: float
-    """World units: diagonal of the box around all cameras; at least a tenth of the points'."""
+    """World units, see `scene_extent`."""
     focal: float
     """Median focal length, pixels."""
     labels: tuple[str, ...]
@@ -116,6 +127,8 @@ class Certificate:
     """All pairs of periods, earlier first."""
     evidence: Evidence
     """Observations on which the figures are measured."""
+    facing: bool = False
+    """True if the extent is a depth: cameras look one way from nearly one place."""
     features: str = METHOD
     """Name of the features and matches that it was made with."""
     resection: Resection | None = None
@@ -137,6 +150,7 @@ def certify(model: Registered) -> Certificate:
         resection=model.resection,
         unit=model.unit,
         extent=extent,
+        facing=_span(model) < extent,
         focal=float(np.median(focals)) if focals else float("nan"),
         labels=tuple(model.labels),
         periods=tuple(_period(model, evidence, p) for p in range(model.num_periods)),
@@ -149,15 +163,31 @@ def certify(model: Registered) -> Certificate:
 
 
 def scene_extent(model: Registered) -> float:
-    """Diagonal of the box around the cameras; at least a tenth of that of the points."""
+    """Diagonal of the box around the cameras; at least the median depth of what they see.
+
+    It is also at least a tenth of the diagonal of the points.
+
+    Cameras that look one way from nearly one place move what they see by that share of its depth,
+    in the images and along the view, however close to each other they are.
+    """
     size = 0.0
     if len(model.points):
         low, high = np.percentile(model.points, [5, 95], axis=0)
         size = 0.1 * float(np.linalg.norm(high - low))
-    if len(model.names):
-        centres = camera_centre(model.cam_from_world)
-        size = max(size, float(np.linalg.norm(np.ptp(centres, axis=0))))
-    return size
+    rows = slice(None, None, len(model.track_image) // MAX_OBSERVATIONS + 1)
+    along = model.cam_from_world[model.track_image[rows], 2]
+    points = model.points[track_owners(model.track_start)[rows]]
+    if len(points):
+        depth = (along[:, :3] * points).sum(axis=1) + along[:, 3]
+        size = max(size, float(np.median(depth)))
+    return max(size, _span(model))
+
+
+def _span(model: Registered) -> float:
+    """Diagonal of the box around the cameras."""
+    if not len(model.names):
+        return 0.0
+    return float(np.linalg.norm(np.ptp(camera_centre(model.cam_from_world), axis=0)))
 
 
 def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures:
@@ -195,13 +225,22 @@ def _pair(
     misalignment: Misalignment | str = nothing
     if good.any():
         figures = _held_out(moved, good, (placed_a, placed_b), _epipolar(model, evidence, periods))
-        measured = measure(moved, placed_a, placed_b, centres)
+        measured = measure(moved, placed_a, placed_b, centres, CORE)
         misalignment = measured or "held-out tracks are too few, or too close together"
-    by_all = measure(*_all_transfers(model, evidence, a, b), centres)
+    by_all = measure(*_all_transfers(model, evidence, a, b), centres, CORE)
     of_a, of_b = (evidence.ties.where(model.periods[evidence.ties.image] == p) for p in periods)
     sigma = by_all.shift.high / 1.96 if by_all is not None else 0.0
     middle = np.median(camera_centre(model.cam_from_world), axis=0)
+    surfaces = surface_distance(
+        evidence.clouds[a],
+        evidence.clouds[b],
+        middle,
+        sigma,
+        None if by_all is None else by_all.motion,
+    )
     return PairFigures(
+        by_ties_and_surfaces=_with_surfaces(by_all, surfaces),
+        independent=_with_surfaces(misalignment, surfaces),
         a=a,
         b=b,
         ties=spread,
@@ -211,8 +250,18 @@ def _pair(
         or "tracks seen by two images of one period are too few, or too close together",
         localised_b=localise(of_b, evidence.ties_placed[a]),
         localised_a=localise(of_a, evidence.ties_placed[b]),
-        surfaces=surface_distance(evidence.clouds[a], evidence.clouds[b], middle, sigma),
+        surfaces=surfaces,
     )
+
+
+def _with_surfaces(
+    found: Misalignment | str | None, surfaces: SurfaceDistance | str
+) -> tuple[Interval, Interval] | None:
+    """Rotation and displacement by tracks and surfaces together."""
+    if not isinstance(found, Misalignment) or isinstance(surfaces, str) or surfaces.motion is None:
+        return None
+    both = surfaces.motion.joined(found.motion)
+    return None if both is None else both.intervals()
 
 
 def _all_transfers(
@@ -245,18 +294,21 @@ def _held_out(
     error, expected, distance = (x[good] for x in transfer_errors(moved))
     found, slot = placed_b.find(placed_a.track)
     gaps = np.linalg.norm(placed_a.xyz[found] - placed_b.xyz[slot], axis=1)
+    agrees = error < AGREES * np.maximum(1.0, expected)
+    noise = float(np.median((error / expected)[agrees if agrees.any() else ...]))
     return HeldOut(
         tracks=len(np.unique(moved.rays.track[good])),
         observations=int(good.sum()),
         median=float(np.median(error)),
         p90=float(np.percentile(error, 90)),
-        noise=float(np.median(error / expected)),
-        agreeing=float(np.mean(error < AGREES * np.maximum(1.0, expected))),
+        noise=noise,
+        agreeing=float(np.mean(agrees)),
         distance=float(np.median(distance)),
         gap=float(np.median(gaps)) if len(gaps) else None,
         gap_tracks=len(gaps),
         epipolar=float(np.median(epipolar)) if len(epipolar) else None,
         matches=len(epipolar),
+        disagreement=disagreement(moved.where(good), ~agrees, placed, noise),
     )
 
 

@@ -8,12 +8,13 @@ follow from the residuals: a registration is as good as the largest motion they 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, place, project
+from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3, fit_robustly
 
 MIN_TRACKS = 12  # Fewer tracks do not determine seven unknowns and their spread
@@ -23,6 +24,13 @@ DRAWS = 400  # Random motions that give the spread of an angle or a distance
 
 GROSS_PIXELS = 20.0
 """Median residual above which the search starts from the positions of the points."""
+
+CORE = 0.25
+"""Share of the smallest residuals that gives the noise where false ties may be many."""
+
+CONTRADICTS = 18.5  # Chi-square of seven parameters, 99 %
+
+MAX_SEEN = 500  # Observations by which a change in depth is measured
 
 NOISE_FLOOR = 0.1  # Pixels: no feature is located better, even if a few residuals are smaller
 
@@ -41,6 +49,12 @@ class Transfers:
 
     def __len__(self) -> int:
         return len(self.rays)
+
+    def where(self, mask: Mask) -> Transfers:
+        """Some of the observations."""
+        return Transfers(
+            self.rays.where(mask), self.xyz[mask], self.covariance[mask], self.backward[mask]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +77,70 @@ class Misalignment:
     rotation: Interval
     """Degrees."""
     shift: Interval
-    """Median displacement of the cameras of both periods, in world units."""
+    """Median displacement of the cameras of both periods, or change in the depth of the points that
+    they see if that is larger, in world units."""
+    motion: Motion
+    """The estimate again, with its covariance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Seven parameters of a small similarity about a point, as of `generators`."""
+
+    step: Array
+    """[7]"""
+    covariance: Array
+    """[7, 7]"""
+    middle: Array
+    """[3]"""
+    centres: Array
+    """Cameras whose displacement is measured. [C, 3]"""
+    seen: Array
+    """Points and the cameras that see them, whose depth is measured. [2, O, 3]"""
+
+    def similarity(self, step: Array) -> Sim3:
+        """Motion with other parameters."""
+        return _compose(step, Sim3.identity(), self.middle)
+
+    def displacement(self, similarity: Sim3) -> float:
+        """Displacement of cameras or points, see `Misalignment.shift`."""
+        moved = np.linalg.norm(similarity.apply(self.centres) - self.centres, axis=1)
+        points, cameras = self.seen
+        rays = points - cameras
+        deeper = (similarity.apply(points) - points) * rays
+        depth = np.abs(deeper.sum(axis=1)) / np.maximum(np.linalg.norm(rays, axis=1), 1e-300)
+        return max(float(np.median(moved)), float(np.median(depth)))
+
+    def about(self, middle: Array) -> Motion:
+        """The same motion with parameters about another point."""
+        moved = np.eye(7)
+        moved[:3] = generators((middle - self.middle)[None])[0]
+        step, covariance = moved @ self.step, moved @ self.covariance @ moved.T
+        return replace(self, step=step, covariance=covariance, middle=middle)
+
+    def joined(self, other: Motion) -> Motion | None:
+        """Both estimates weighted by their information; None if they contradict each other."""
+        other = other.about(self.middle)
+        gap = self.step - other.step
+        if gap @ np.linalg.solve(self.covariance + other.covariance, gap) > CONTRADICTS:
+            return None
+        mine, its = np.linalg.inv(self.covariance), np.linalg.inv(other.covariance)
+        covariance = np.linalg.inv(mine + its)
+        return replace(
+            self, step=covariance @ (mine @ self.step + its @ other.step), covariance=covariance
+        )
+
+    def intervals(self, similarity: Sim3 | None = None) -> tuple[Interval, Interval]:
+        """Rotation and displacement of an estimate with this covariance."""
+        similarity = self.similarity(self.step) if similarity is None else similarity
+        rng = np.random.default_rng(0)
+        steps = rng.multivariate_normal(np.zeros(7), self.covariance, DRAWS, method="eigh")
+        drawn = [_compose(step, similarity, self.middle) for step in steps]
+        noise = [self.similarity(step) for step in steps]
+        return (
+            _interval(lambda m: rotation_angle(m.rotation), similarity, drawn, noise),
+            _interval(self.displacement, similarity, drawn, noise),
+        )
 
 
 def transfers(
@@ -121,7 +198,11 @@ def transfer_variance(jacobian: Array, covariance: Array) -> Array:
 
 
 def measure(
-    moved: Transfers, placed_a: PlacedPoints, placed_b: PlacedPoints, centres: Array
+    moved: Transfers,
+    placed_a: PlacedPoints,
+    placed_b: PlacedPoints,
+    centres: Array,
+    core: float = 0.5,
 ) -> Misalignment | None:
     """Estimate the similarity between two periods, with its uncertainty.
 
@@ -132,7 +213,8 @@ def measure(
         moved: From `transfers`.
         placed_a: Points as the first period places them.
         placed_b: Points as the second period places them.
-        centres: Cameras of the second period, whose motion is reported. [C, 3]
+        centres: Cameras whose motion is reported. [C, 3]
+        core: Share of the smallest residuals that gives the noise.
 
     Returns:
         None with fewer than `MIN_TRACKS` tracks, or if they do not determine the motion.
@@ -145,7 +227,7 @@ def measure(
     similarity = _begin(moved, placed_a, placed_b)
     for _ in range(STEPS):
         residual, jacobian = _residuals(moved, similarity, middle)
-        weight, _ = _weights(residual, jacobian[1])
+        weight, _ = _weights(residual, jacobian[1], core)
         normal, gradient = _sum(residual, jacobian[0], weight)
         try:
             step: Array = np.asarray(-np.linalg.solve(normal, gradient), np.float64)
@@ -156,7 +238,7 @@ def measure(
         similarity = _compose(step, similarity, middle)
         if np.abs(step).max() < 1e-10:
             break
-    return _describe(moved, similarity, middle, centres)
+    return _describe(moved, similarity, middle, centres, core)
 
 
 def _begin(moved: Transfers, placed_a: PlacedPoints, placed_b: PlacedPoints) -> Sim3:
@@ -199,12 +281,13 @@ def generators(x: Array) -> Array:
     return out
 
 
-def _weights(residual: Array, variance: Array) -> tuple[Array, float]:
+def _weights(residual: Array, variance: Array, core: float) -> tuple[Array, float]:
     """Weights of observations, zero behind the camera, and the noise in pixels per axis."""
     square = (residual**2).sum(axis=1) / variance
     seen = np.isfinite(square)
-    # The median of a Rayleigh distribution is 1.1774 standard deviations per axis.
-    noise = np.sqrt(np.median(square[seen])) / 1.1774 if seen.any() else 1.0
+    # By the quantiles of a Rayleigh distribution, in standard deviations per axis.
+    scale = np.sqrt(-2 * np.log(1 - core))
+    noise = np.sqrt(np.quantile(square[seen], core)) / scale if seen.any() else 1.0
     noise = max(float(noise), NOISE_FLOOR)
     weight = 1.0 / (variance * noise**2 * (1.0 + square / (2.0 * noise) ** 2))
     return np.where(seen, np.nan_to_num(weight), 0.0), noise
@@ -231,28 +314,33 @@ def _compose(step: Array, similarity: Sim3, middle: Array) -> Sim3:
 
 
 def _describe(
-    moved: Transfers, similarity: Sim3, middle: Array, centres: Array
+    moved: Transfers, similarity: Sim3, middle: Array, centres: Array, core: float
 ) -> Misalignment | None:
     residual, (jacobian, variance) = _residuals(moved, similarity, middle)
-    weight, noise = _weights(residual, variance)
+    weight, noise = _weights(residual, variance, core)
     covariance = _sandwich(moved.rays.track, residual, jacobian, weight)
     if covariance is None:
         return None
-    rng = np.random.default_rng(0)
-    steps = rng.multivariate_normal(np.zeros(7), covariance, DRAWS, method="eigh")
-    drawn = [_compose(step, similarity, middle) for step in steps]
-    noise_only = [_compose(step, Sim3.identity(), middle) for step in steps]
-
-    def displacement(similarity: Sim3) -> float:
-        return float(np.median(np.linalg.norm(similarity.apply(centres) - centres, axis=1)))
-
-    agreeing = (residual**2).sum(axis=1) < 9 * noise**2 * variance
-    return Misalignment(
-        tracks=len(np.unique(moved.rays.track[agreeing])),
-        similarity=similarity,
-        rotation=_interval(lambda m: rotation_angle(m.rotation), similarity, drawn, noise_only),
-        shift=_interval(displacement, similarity, drawn, noise_only),
+    some = slice(None, None, len(moved) // MAX_SEEN + 1)
+    motion = Motion(
+        step=_parameters(similarity, middle),
+        covariance=covariance,
+        middle=middle,
+        centres=centres,
+        seen=np.stack([moved.xyz[some], camera_centre(moved.rays.pose[some])]),
     )
+    agreeing = (residual**2).sum(axis=1) < 9 * noise**2 * variance
+    tracks = len(np.unique(moved.rays.track[agreeing]))
+    return Misalignment(tracks, similarity, *motion.intervals(similarity), motion)
+
+
+def _parameters(similarity: Sim3, middle: Array) -> Array:
+    """Inverse of `_compose`, after the identity. [7]"""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(similarity.rotation).as_rotvec()
+    shift = similarity.apply(middle) - middle
+    return np.concatenate([shift, turn, [np.log(similarity.scale)]])
 
 
 def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> Array | None:

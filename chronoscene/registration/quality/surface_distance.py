@@ -10,12 +10,12 @@ instead of a cylinder, because sparse clouds differ widely in density.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from chronoscene.arrays import Array, Mask
-from chronoscene.registration.quality.misalignment import Interval
+from chronoscene.registration.quality.misalignment import Interval, Motion, generators
 from chronoscene.registration.quality.rays import PlacedPoints
 from chronoscene.scene.similarity import SIGMA
 
@@ -49,10 +49,16 @@ class SurfaceDistance:
     """Share of the stable core points beyond their level of detection."""
     shift: Interval
     """Translation that would bring the clouds together, with its 95% interval."""
+    motion: Motion | None = None
+    """Similarity that would, which owes nothing to matches."""
 
 
 def surface_distance(
-    first: PlacedPoints, second: PlacedPoints, centre: Array, registration: float
+    first: PlacedPoints,
+    second: PlacedPoints,
+    centre: Array,
+    registration: float,
+    like: Motion | None = None,
 ) -> SurfaceDistance | str:
     """Compare the point clouds of two periods; the reason, where that is not possible.
 
@@ -61,6 +67,7 @@ def surface_distance(
         second: Points placed by the images of the other.
         centre: Some camera centre: normals are turned to it. [3]
         registration: Standard deviation of the alignment, in world units.
+        like: Motion whose point and cameras that of the surfaces is to have; None for no motion.
     """
     from scipy.spatial import cKDTree
 
@@ -86,7 +93,17 @@ def surface_distance(
     along = ((second.xyz[mine] - mean[:, None]) * normal[:, None]).sum(axis=2)
     distance, other, count = _mean_within(along[usable], inside[usable])
     chance = np.sqrt(spread[usable] ** 2 / NEIGHBOURS + other**2 / count)
-    return _summary(distance, normal[usable], chance, registration)
+    mean, normal = mean[usable], normal[usable]
+    stable = _stable(distance, normal, chance)
+    if stable.sum() < MIN_CORES:
+        return f"only {int(stable.sum())} core points on structure that did not change"
+    distance, chance, normal, mean = (x[stable] for x in (distance, chance, normal, mean))
+    found = _summary(len(stable), distance, normal, chance, registration)
+    if like is None:
+        return found
+    facing = np.einsum("ni,nij->nj", normal, generators(mean - like.middle))
+    motion, covariance = _solve(distance, facing, chance)
+    return replace(found, motion=replace(like, step=motion, covariance=covariance))
 
 
 def _planes(patches: Array) -> tuple[Array, Array, Array]:
@@ -113,20 +130,18 @@ def _mean_within(along: Array, inside: Mask) -> tuple[Array, Array, Array]:
 
 
 def _summary(
-    distance: Array, normal: Array, chance: Array, registration: float
-) -> SurfaceDistance | str:
-    stable = _stable(distance, normal, chance)
-    if stable.sum() < MIN_CORES:
-        return f"only {int(stable.sum())} core points on structure that did not change"
+    cores: int, distance: Array, normal: Array, chance: Array, registration: float
+) -> SurfaceDistance:
+    """Figures of the core points that did not change."""
     level = CONFIDENCE * chance + registration
-    size = np.abs(distance[stable])
+    size = np.abs(distance)
     return SurfaceDistance(
-        cores=len(distance),
-        stable=int(stable.sum()),
+        cores=cores,
+        stable=len(distance),
         median=float(np.median(size)),
-        level=float(np.median(level[stable])),
-        beyond=float(np.mean(size > level[stable])),
-        shift=_shift(distance[stable], normal[stable], chance[stable]),
+        level=float(np.median(level)),
+        beyond=float(np.mean(size > level)),
+        shift=_shift(distance, normal, chance),
     )
 
 
@@ -156,18 +171,30 @@ def _shift(distance: Array, normal: Array, chance: Array) -> Interval:
 
     A direction that no surface faces (such as along a street) gets a wide interval.
     """
-    weight = 1.0 / np.maximum(chance, np.median(chance) * 0.1) ** 2
-    prior = 1e-6 * weight.sum() * np.eye(3)
-    robust = np.ones(len(distance))
-    for _ in range(5):
-        w = weight * robust
-        left = np.einsum("ni,n,nj->ij", normal, w, normal) + prior
-        t = np.linalg.solve(left, normal.T @ (w * distance))
-        residual = (distance - normal @ t) * np.sqrt(weight)
-        scale = max(float(SIGMA * np.median(np.abs(residual))), 1e-12)
-        robust = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
-    # Neighbouring patches share points: about NEIGHBOURS core points make one independent one.
-    covariance = np.linalg.inv(left) * scale**2 * NEIGHBOURS
+    t, covariance = _solve(distance, normal, chance)
     spread = CONFIDENCE * float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     value = float(np.linalg.norm(t))
     return Interval(value, low=max(0.0, value - spread), high=value + spread)
+
+
+def _solve(distance: Array, facing: Array, chance: Array) -> tuple[Array, Array]:
+    """Parameters with ``facing @ parameters = distance``, reweighted, and their covariance.
+
+    Args:
+        distance: Along the normals. [K]
+        facing: Its derivatives. [K, n]
+        chance: Standard deviation of a distance. [K]
+    """
+    weight = 1.0 / np.maximum(chance, np.median(chance) * 0.1) ** 2
+    # A prior for what no surface determines; parameters differ in unit.
+    prior = 1e-6 * weight.sum() * np.diag(np.maximum((facing**2).mean(axis=0), 1e-12))
+    robust = np.ones(len(distance))
+    for _ in range(5):
+        w = weight * robust
+        left = np.einsum("ni,n,nj->ij", facing, w, facing) + prior
+        step = np.linalg.solve(left, facing.T @ (w * distance))
+        residual = (distance - facing @ step) * np.sqrt(weight)
+        scale = max(float(SIGMA * np.median(np.abs(residual))), 1e-12)
+        robust = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
+    # Neighbouring patches share points: about NEIGHBOURS core points make one independent one.
+    return step, np.linalg.inv(left) * scale**2 * NEIGHBOURS

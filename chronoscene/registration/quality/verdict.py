@@ -17,7 +17,7 @@ from chronoscene.arrays import Array
 from chronoscene.registration.quality.certificate import Certificate, PairFigures, PeriodFigures
 from chronoscene.registration.quality.gps_fit import PeriodGpsFit
 from chronoscene.registration.quality.localisation import Localisation
-from chronoscene.registration.quality.misalignment import MIN_TRACKS, Misalignment
+from chronoscene.registration.quality.misalignment import MIN_TRACKS, Interval, Misalignment
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
 from chronoscene.registration.result import ANOTHER_PLACE
 
@@ -55,6 +55,7 @@ _LOOK = (
     "look at the comparisons on the page (--report); if flat ground that did not change jumps in "
     f"most of them, {_CLICK}"
 )
+_WORST = "look at the worst pair on the page (--report); remove its photos if they do not fit"
 _PLACE = "check that the photos show this place; leave out those that do not"
 _CONTROL = "give ground control: --tie-points with world coordinates"
 
@@ -92,10 +93,23 @@ THRESHOLDS: dict[str, Threshold] = {
     ),
     "agreeing": Threshold(
         what="share of held-out observations that agree",
-        doubtful=0.75, fail=0.15, larger_is_better=True,
-        why="correct registrations reach 0.85 and more; with fewer, part of the matches or of the "
-        "poses is wrong, or matching is misled by repeated structure",
-        todo="look at the worst pair on the page (--report); remove its photos if they do not fit",
+        doubtful=0.35, fail=0.15, larger_is_better=True,
+        why="false matches that are scattered do no harm, but with more of them than right ones "
+        "the estimate may be one of theirs",
+        todo=_WORST,
+    ),
+    "together": Threshold(
+        what="share of held-out observations that disagree in one direction",
+        doubtful=0.08,
+        why="matches that err by one step come from repeated structure, and these may be the right "
+        "ones",
+        todo=_LOOK,
+    ),
+    "gathered": Threshold(
+        what="share of held-out observations that disagree and gather in some images",
+        doubtful=0.15,
+        why="the poses of these images are wrong, or those of the others",
+        todo=_WORST,
     ),
     "excess": Threshold(
         what="held-out residual beyond the noise of matching, as an angle",
@@ -128,6 +142,13 @@ THRESHOLDS: dict[str, Threshold] = {
         unit="% of extent", doubtful=0.15,
         why="surfaces are compared without matches, so repeated structure shows here; but a beach "
         "or a quarry may really have moved",
+        todo=_LOOK,
+    ),
+    "open": Threshold(
+        what="shift between the surfaces of two periods that is not ruled out",
+        unit="% of extent", doubtful=0.75,
+        why="matches of repeated structure agree with each other wherever they lead; surfaces must "
+        "exclude its steps",
         todo=_LOOK,
     ),
     "surfaces": Threshold(
@@ -169,6 +190,13 @@ THRESHOLDS: dict[str, Threshold] = {
 
 FITTED = 1.3
 """Upper limit of the ratio of the noise of an observation to its residual after fitting."""
+
+FEW_TRACKS = 4  # Held-out tracks that support other evidence where they are too few to measure
+FEW_AGREEING = 0.5  # Share of their observations that agrees
+FACING = 0.8
+"""Share of the error of localised images that counts in forward-facing captures: turns and shifts
+of a camera make up for each other there."""
+MARGIN = 0.8  # Of the limits, within which an interval must end that other evidence confirms
 
 MIN_TIES = 3  # Tie points, clicked ones for example, that two periods need to be linked
 
@@ -308,25 +336,31 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
     place = f"periods {names[pair.a]} and {names[pair.b]}"
     yield from _alignment(certificate, pair, place)
     if not isinstance(pair.held_out, str) and pair.held_out.tracks >= MIN_TRACKS:
-        yield from _check("agreeing", pair.held_out.agreeing, place)
+        held = pair.held_out
+        yield from _check("agreeing", held.agreeing, place)
+        yield from _check("together", (1 - held.agreeing) * held.disagreement.step, place)
+        yield from _check("gathered", (1 - held.agreeing) * held.disagreement.images, place)
         yield from _check("excess", _excess(certificate, pair), place)
-    yield from _check("occupied", pair.ties.occupied, place)
+    if not _confirmed(certificate, pair):
+        yield from _check("occupied", pair.ties.occupied, place)
     yield from _check("tied", min(pair.ties.tied_a, pair.ties.tied_b), place)
     for found in (pair.localised_b, pair.localised_a):
         if isinstance(found, Localisation) and found.images >= 3:
-            yield from _check("localised", _localised(found, certificate.extent), place)
+            yield from _check("localised", _localised(found, certificate), place)
     if isinstance(pair.surfaces, SurfaceDistance):
         shift = pair.surfaces.shift
         if shift.low > 0:
             yield from _check("clouds", 100 * shift.value / certificate.extent, place)
+        yield from _check("open", 100 * shift.high / certificate.extent, place)
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
-def _localised(found: Localisation, extent: float) -> float:
+def _localised(found: Localisation, certificate: Certificate) -> float:
     """The larger of both errors against its limit; it fails only as far as it is certain."""
     turn, place = found.rotation_excess, found.centre_excess
+    share = FACING if certificate.facing else 1.0
     likely, certain = (
-        max(r / _limit("rotation"), 100 * c / extent / _limit("shift"))
+        share * max(r / _limit("rotation"), 100 * c / certificate.extent / _limit("shift"))
         for r, c in ((turn.value, place.value), (turn.low, place.low))
     )
     bad = THRESHOLDS["localised"].fail
@@ -337,33 +371,75 @@ def _localised(found: Localisation, extent: float) -> float:
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
     """Judge the alignment of two periods, and its uncertainty.
 
-    They are misaligned if either interval lies beyond the limit. They are aligned if the interval
-    of the precise measurement (all ties) ends below the limit, and the independent one (held-out
-    tracks) agrees: its interval ends below the limit, or its estimate lies below it and its
-    interval ends below twice the limit.
+    They are misaligned if the interval of all ties or of held-out tracks lies beyond the limit.
+    They are aligned if the interval of the precise measurement (all ties, and the surfaces) ends
+    below the limit, and an independent one (held-out tracks, and the surfaces) agrees: its interval
+    ends below the limit, or its estimate lies below it and its interval ends below twice the limit.
+    Where it is wider, with its estimate below the limit, surfaces must confirm a precise
+    measurement with a margin.
     """
     held, by_all = pair.misalignment, pair.by_all
-    if isinstance(held, str) or isinstance(by_all, str):
+    confirmed = _confirmed(certificate, pair)
+    if isinstance(by_all, str) or (isinstance(held, str) and not confirmed):
         tracks = 0 if isinstance(pair.held_out, str) else pair.held_out.tracks
         reason = held if isinstance(held, str) else str(by_all)
         yield from _check("held_out", min(tracks, 11), place, f" ({reason})")
-        if isinstance(by_all, str):
-            return
-        held = by_all
-    for key, factor in (("rotation", 1.0), ("shift", 100.0 / certificate.extent)):
-        limit = _limit(key)
-        one, every = getattr(held, key), getattr(by_all, key)
-        low = max(one.low, every.low) * factor
-        high, loose, estimate = every.high * factor, one.high * factor, one.value * factor
-        if low > limit:
+    if isinstance(by_all, str):
+        return
+    for i, (key, factor) in enumerate((("rotation", 1.0), ("shift", 100.0 / certificate.extent))):
+        limit, every = _limit(key), getattr(by_all, key)
+        one = every if isinstance(held, str) else getattr(held, key)
+        high = _precise(pair)[i].high * factor
+        if max(one.low, every.low) * factor > limit:
             yield from _check(key, max(one.value, every.value) * factor, place)
-        elif high > limit or (loose > limit and (estimate > limit or loose > 2 * limit)):
+            continue
+        if pair.independent is not None:
+            one = min(one, pair.independent[i], key=lambda x: x.high)
+        loose, estimate = one.high * factor, one.value * factor
+        beyond = loose > limit and estimate > limit  # Nothing confirms what this contradicts
+        if high > limit or beyond or (loose > 2 * limit and not confirmed):
             t = THRESHOLDS[key]
             found = (
                 f"{t.what}: {estimate:.3g} {t.unit}, but up to {max(high, loose):.3g} cannot be "
                 f"ruled out; expected at most {limit:g}"
             )
             yield Objection("doubtful", key, place, found, t.why, t.todo)
+
+
+def _precise(pair: PairFigures) -> tuple[Interval, Interval]:
+    """Rotation and displacement by all ties, and by the surfaces if these narrow them."""
+    assert isinstance(pair.by_all, Misalignment)
+    ties = pair.by_all.rotation, pair.by_all.shift
+    both = pair.by_ties_and_surfaces or ties
+    return min(ties[0], both[0], key=_high), min(ties[1], both[1], key=_high)
+
+
+def _high(interval: Interval) -> float:
+    return interval.high
+
+
+def _confirmed(certificate: Certificate, pair: PairFigures) -> bool:
+    """True if surfaces and localised images confirm precise ties, and held-out tracks support them.
+
+    Surfaces exclude a step of repeated structure; how far few ties determine the rotation is then
+    a question of their noise, which the interval answers.
+    """
+    held, surfaces = pair.held_out, pair.surfaces
+    if isinstance(pair.by_all, str) or isinstance(surfaces, str) or isinstance(held, str):
+        return False
+    if isinstance(pair.misalignment, Misalignment) and pair.independent is None:
+        return False  # Surfaces contradict the held-out tracks
+    local = (pair.localised_a, pair.localised_b)
+    percent = 100 / certificate.extent
+    turn, shift = _precise(pair)
+    return (
+        held.tracks >= FEW_TRACKS
+        and held.agreeing >= FEW_AGREEING
+        and all(isinstance(x, Localisation) and x.images >= 3 for x in local)
+        and percent * surfaces.shift.high <= _limit("shift")
+        and turn.high <= MARGIN * _limit("rotation")
+        and percent * shift.high <= MARGIN * _limit("shift")
+    )
 
 
 def _limit(key: str) -> float:
@@ -432,6 +508,7 @@ def _bounds(certificate: Certificate, pairs: list[tuple[int, int]]) -> Array:
         if (pair.a, pair.b) in pairs:
             weights[pair.a, pair.b] = 1e6
             if isinstance(pair.by_all, Misalignment):
+                # By ties alone: errors of surfaces are not independent from link to link.
                 shift = 100 * pair.by_all.shift.high / certificate.extent / _limit("shift")
                 worst = max(pair.by_all.rotation.high / _limit("rotation"), shift, 1e-3)
                 weights[pair.a, pair.b] = worst**2

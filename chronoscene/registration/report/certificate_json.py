@@ -105,6 +105,13 @@ def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure
         ("by held-out tracks and ties", pair.by_all),
     ):
         yield from _misalignment_figures(certificate, name, found, unit)
+    for name, both in (
+        ("by held-out tracks and surfaces", pair.independent),
+        ("by held-out tracks, ties and surfaces", pair.by_ties_and_surfaces),
+    ):
+        if both is not None:
+            yield _interval(f"rotation {name}", both[0], "degrees", "agreeing tracks, core points")
+            yield _interval(f"displacement {name}", both[1], unit, "agreeing tracks, core points")
     for name, other, local in (
         (names[1], names[0], pair.localised_b),
         (names[0], names[1], pair.localised_a),
@@ -128,6 +135,12 @@ def _held_out_figures(held: HeldOut | str, unit: str) -> Iterator[Figure]:
     yield Figure("held-out reprojection error, 90%", held.p90, "px", over)
     yield Figure("held-out reprojection error, median", held.distance, unit, over)
     yield Figure("held-out observations that agree", 100 * held.agreeing, "%", over)
+    others = 100 * (1 - held.agreeing)
+    for name, share in (
+        ("held-out observations that disagree in one direction", held.disagreement.step),
+        ("held-out observations that disagree and gather in images", held.disagreement.images),
+    ):
+        yield Figure(name, others * share, "%", over)
     tracks = f"{held.gap_tracks} tracks"
     missing = None if held.gap is not None else "no track is placed by both periods"
     yield Figure("gap between both periods' points", held.gap, unit, tracks, absent=missing)

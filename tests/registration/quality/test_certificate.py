@@ -396,6 +396,16 @@ def test_extent_of_cameras_that_stand_still(good: Registered) -> None:
     assert 5 < scene_extent(still) < 30
 
 
+def test_a_forward_facing_capture_is_measured_by_its_depth() -> None:
+    """Right ones pass although cameras stand close together, wrong ones fail."""
+    case = CaseSettings(arc=20.0, ties=600, points=2000, views=16, seed=5, gps_noise=None)
+    certificate = certify(generate_case(case).model)
+    assert 80 < certificate.extent < 130
+    assert judge(certificate).level == "pass"
+    for wrong in (replace(case, scale=0.01), replace(case, rotation=0.3), replace(case, shift=0.6)):
+        assert judge(certify(generate_case(wrong).model)).level == "fail"
+
+
 def test_the_documented_thresholds_are_those_of_the_code() -> None:
     text = (Path(__file__).parents[3] / "docs/reference/certificate.md").read_text(encoding="utf-8")
     for t in (*THRESHOLDS.values(), *POSITION_THRESHOLDS.values()):

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.registration.generated import CaseSettings, Generated, generate_case, pose_errors
 from chronoscene.registration.quality.misalignment import (
+    Motion,
     _interval,
     _sandwich,
     measure,
@@ -146,6 +147,34 @@ def test_intervals_hold_the_truth() -> None:
         truth = np.median(rotation[model.periods == 1])
         hits += found.rotation.low <= truth <= found.rotation.high
     assert hits >= 18
+
+
+def test_motions_about_two_points_are_one_and_join_by_their_information() -> None:
+    rng = np.random.default_rng(0)
+    step = rng.normal(0, 1e-5, 7)
+    root = rng.normal(0, 1e-3, (7, 7))
+    centres = rng.normal(0, 5, (4, 3))
+    motion = Motion(step, root @ root.T, np.zeros(3), centres, np.stack([centres, centres + 1]))
+    moved = motion.about(np.array([3.0, -2.0, 7.0]))
+    x = rng.normal(0, 10, (5, 3))
+    for one, other in ((motion, moved), (moved.about(np.zeros(3)), motion)):
+        np.testing.assert_allclose(
+            one.similarity(one.step).apply(x), other.similarity(other.step).apply(x), atol=1e-7
+        )
+    twice = motion.joined(moved)
+    assert twice is not None
+    np.testing.assert_allclose(twice.step, motion.step, atol=1e-12)
+    np.testing.assert_allclose(twice.covariance, motion.covariance / 2, rtol=1e-5, atol=1e-12)
+    assert motion.joined(replace(moved, step=moved.step + 1.0)) is None
+
+
+def test_a_scale_about_cameras_shows_in_the_depth_of_points() -> None:
+    centres, points = np.zeros((3, 3)), np.array([[0.0, 0, 10], [1, 0, 20], [0, 2, 30]])
+    step = np.array([0, 0, 0, 0, 0, 0, 0.01])
+    seen = np.stack([points, centres])
+    motion = Motion(step, np.eye(7), np.zeros(3), centres, seen)
+    moved = motion.displacement(motion.similarity(step))
+    assert moved == pytest.approx(np.expm1(0.01) * np.linalg.norm(points[1]))
 
 
 def test_bounds_are_as_far_away_as_the_errors_are_large(exact: Generated) -> None:
