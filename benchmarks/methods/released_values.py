@@ -1,4 +1,4 @@
-"""What each value of a method's released code changes: differences of a study, paired by seed.
+"""Effect of each value of a method's released code: differences of a study, paired by seed.
 
     python -m benchmarks.methods.released_values 4dgs-released SCENE [--seeds 3] [--out runs]
 

@@ -394,7 +394,7 @@ def _by_ties(model: Registered, seen: _Sightings, a: int, b: int) -> Sim3 | None
     mine = model.periods == b
     poses[mine] = first.apply_to_pose(poses[mine])
     moved, placed_a, placed_b = transfers(replace_poses(rays, poses), model.periods, a, b)
-    refined = measure(moved, placed_a, placed_b, camera_centre(poses[mine]))
+    refined = measure(moved, placed_a, placed_b, camera_centre(poses[mine]), core=0.5)
     if refined is None:
         return first
     return refined.similarity.inverse() @ first

@@ -256,7 +256,7 @@ def test_the_defaults_train_as_the_released_code_does_in_world_units(
     noise_set: Callable[[int], TrainingSet], factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Near plane, offset rate, volume weight and scale bound: wrong in one, and models differ."""
-    raise_eps(monkeypatch, 1e-6)
+    raise_eps(monkeypatch, 1e-5)  # some gradients are hardly larger than rounding
     options = GROWING | {
         "voxel_unit": "world",
         "voxel_size": 0.08 * factor,
@@ -273,9 +273,7 @@ def test_the_defaults_train_as_the_released_code_does_in_world_units(
     for name, tensor in mine.items():
         scale, offset = shift.get(name, (1.0, 0.0))
         difference = tensor * scale + offset - theirs[name]
-        # Rounding may decide whether a Gaussian is just switched on, or in front of the near plane.
-        equal = difference.abs() < 1e-5 * max(1.0, scale)
-        assert equal.float().mean() > 0.95 and difference.abs().max() < 1e-3 * max(1.0, scale), name
+        assert difference.abs().max() < 1e-5 * max(1.0, scale), name
     bound = ours.model.log_scales[:, 3:].max().item()
     assert bound == pytest.approx(np.log(0.06), abs=0.02)  # reached, up to the steps since
 

@@ -18,7 +18,6 @@ from chronoscene.registration.quality.disagreement import Disagreement, disagree
 from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
-    CORE,
     Interval,
     Misalignment,
     Transfers,
@@ -225,9 +224,9 @@ def _pair(
     misalignment: Misalignment | str = nothing
     if good.any():
         figures = _held_out(moved, good, (placed_a, placed_b), _epipolar(model, evidence, periods))
-        measured = measure(moved, placed_a, placed_b, centres, CORE)
+        measured = measure(moved, placed_a, placed_b, centres)
         misalignment = measured or "held-out tracks are too few, or too close together"
-    by_all = measure(*_all_transfers(model, evidence, a, b), centres, CORE)
+    by_all = measure(*_all_transfers(model, evidence, a, b), centres)
     of_a, of_b = (evidence.ties.where(model.periods[evidence.ties.image] == p) for p in periods)
     sigma = by_all.shift.high / 1.96 if by_all is not None else 0.0
     middle = np.median(camera_centre(model.cam_from_world), axis=0)

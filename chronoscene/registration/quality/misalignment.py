@@ -202,7 +202,7 @@ def measure(
     placed_a: PlacedPoints,
     placed_b: PlacedPoints,
     centres: Array,
-    core: float = 0.5,
+    core: float = CORE,
 ) -> Misalignment | None:
     """Estimate the similarity between two periods, with its uncertainty.
 

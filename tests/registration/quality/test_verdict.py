@@ -468,7 +468,7 @@ WEAK: dict[str, Callable[[Certificate], Certificate]] = {
     "tied": lambda c: with_part(c, "ties", (0, 2), tied_b=0.1),
     "agreeing": lambda c: with_part(c, "held_out", (0, 2), agreeing=0.3),
     "excess": lambda c: with_part(c, "held_out", (0, 2), noise=3.0),
-    "localised": lambda c: with_part(c, "localised_a", (0, 2), rotation_excess=Excess(0.3, 0.2)),
+    "localised": lambda c: with_part(c, "localised_a", (0, 2), rotation_excess=Excess(0.3, 0.0)),
     "clouds": lambda c: with_part(c, "surfaces", (0, 2), shift=Interval(0.2, 0.1, 0.3)),
     "surfaces": lambda c: with_part(c, "surfaces", (0, 2), beyond=0.5),
 }
