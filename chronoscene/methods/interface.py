@@ -107,6 +107,8 @@ class StepReport:
     the loss or a gradient was not."""
     not_finite: tuple[str, ...] = ()
     """Names of the tensors whose gradients were not finite, if the method knows them."""
+    views: int = 1
+    """Number of training views that the step has seen: by so many the iterations go on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +171,7 @@ class Method(Protocol):
         """Do one training step.
 
         Args:
-            index: Number of steps done before, from 0.
+            index: Number of iterations done before, from 0: steps, or their `StepReport.views`.
             progress: Share of the training that is over, 0..1. Every schedule (learning rates,
                 densification) follows it, so that a run that ends by the clock goes through the
                 same phases as one that ends after a number of iterations.
