@@ -1,6 +1,6 @@
 """Quality by computing time of trainings with 1, 2 and 4 views to a step.
 
-    python -m benchmarks.training.views_per_step SCENE [--method chronogs] [--preset fast] [--seeds 3]
+    python -m benchmarks.training.views_per_step SCENE [--preset fast] [--seeds 3]
 
 Part of the training views are held back, and the PSNR is on these: the test views say nothing. The
 time is that of the processor, so other work on the machine does not count: one thread, and no time

@@ -239,6 +239,22 @@ class Method(Protocol):
             views: Training views in which the result is to be right.
         """
 
+    def device_memory(self, points: int, periods: int, pixels: int) -> tuple[int, dict[str, int]]:
+        """Estimate the memory that a training takes on a GPU.
+
+        Called before `setup`; only where a method can say it.
+
+        Args:
+            points: Number of sparse points.
+            periods: Number of periods.
+            pixels: Number of pixels of the largest photo.
+
+        Returns:
+            primitives: Number that the estimate is for: at which growth ends, or, without a limit,
+                that of the sparse points.
+            parts: Bytes by what takes them.
+        """
+
     def permute(self, order: NDArray[np.int64]) -> None:
         """Put the anchors or Gaussians of a loaded model into another order. [N]
 
