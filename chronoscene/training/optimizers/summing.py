@@ -5,11 +5,15 @@ A sum in a fixed order has equal bits for any number of threads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
+from numba import prange
 from torch import Tensor
 
+from chronoscene.kernels.compilation import kernel
+from chronoscene.training import devices
 from chronoscene.training.optimizers.adam import DenseTable
 from chronoscene.training.optimizers.row_adam import RowAdam
 
@@ -45,5 +49,24 @@ def use_sum(table: DenseTable | RowAdam, parts: Sequence[Part]) -> None:
     total, places = torch.zeros_like(copies), seen.cumsum(0) - 1
     for rows, read in parts:
         if read.grad is not None:
-            total[places[rows]] += read.grad
+            _add_to_rows(total, places[rows], read.grad)
     copies.grad = total
+
+
+def _add_to_rows(total: Tensor, rows: Tensor, added: Tensor) -> None:
+    """Add to some rows, each named once. [R, ...], int64 [M], [M, ...]"""
+    if devices.has_kernels(total, added):
+        flat = (
+            tensor.reshape(len(tensor), math.prod(total.shape[1:])) for tensor in (total, added)
+        )
+        _add_rows(*(tensor.numpy() for tensor in flat), rows.numpy())
+    else:
+        total[rows] += added
+
+
+@kernel(parallel=True)
+def _add_rows(total, added, rows):  # type: ignore[no-untyped-def]
+    for m in prange(len(rows)):
+        row = rows[m]
+        for c in range(total.shape[1]):
+            total[row, c] += added[m, c]

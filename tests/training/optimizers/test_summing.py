@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from chronoscene.training import devices
 from chronoscene.training.optimizers.adam import DenseTable
 from chronoscene.training.optimizers.row_adam import RowAdam
 from chronoscene.training.optimizers.summing import Part, add_gradients, use_sum
@@ -23,8 +24,11 @@ def parts_of(table: DenseTable | RowAdam) -> list[Part]:
     return found
 
 
+@pytest.mark.parametrize("kernels", [True, False])
 @pytest.mark.parametrize("kind", [DenseTable, RowAdam])
-def test_a_step_uses_the_sum_over_the_views(kind: type[DenseTable | RowAdam]) -> None:
+def test_a_step_uses_the_sum_over_the_views(
+    kind: type[DenseTable | RowAdam], kernels: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Compared with the sum in float64; rows that several views read are counted as often."""
     table = kind(torch.ones(7, 3))
     parts = parts_of(table)
@@ -32,7 +36,10 @@ def test_a_step_uses_the_sum_over_the_views(kind: type[DenseTable | RowAdam]) ->
     for rows, copies in parts:
         assert copies.grad is not None
         np.add.at(whole, rows.numpy(), copies.grad.double().numpy())
-    use_sum(table, parts)
+    with monkeypatch.context() as patch:
+        if not kernels:
+            patch.setattr(devices, "has_kernels", lambda *tensors: False)
+        use_sum(table, parts)
     assert table.fetched is not None
     rows, copies = table.fetched
     assert rows.tolist() == [0, 1, 4, 5] and copies.grad is not None
@@ -55,3 +62,14 @@ def test_gradients_are_added_by_name() -> None:
     for grads in ({"a": torch.ones(2)}, {"b": torch.ones(1)}, {"a": 2 * torch.ones(2)}):
         add_gradients(total, grads)
     assert {name: grad.tolist() for name, grad in total.items()} == {"a": [3.0, 3.0], "b": [1.0]}
+
+
+def test_an_empty_table_and_no_rows_are_possible() -> None:
+    for table in (RowAdam(torch.zeros(0, 3)), RowAdam(torch.zeros(4, 0))):
+        rows = torch.arange(len(table.value))
+        parts = [(rows, table.fetch(rows)) for _ in range(2)]
+        for _, copies in parts:
+            copies.grad = torch.zeros_like(copies)
+        use_sum(table, parts)
+        table.step(0.1)
+        assert table.flush().shape == table.value.shape
