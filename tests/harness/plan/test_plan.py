@@ -59,6 +59,20 @@ def test_a_bench_on_a_gpu_begins_with_what_each_method_takes_of_its_memory(
         assert [line.split()[1] for line in said if " of the GPU with " in line] == expected
 
 
+def test_one_view_to_a_step_is_what_earlier_versions_did(scene_folder, tmp_path):
+    """Their runs, whose settings do not name the option, are neither trained again nor others."""
+    documents = []
+    for number in (1, 2):
+        settings = bench_settings(
+            (scene_folder,), ("3dgs",), tmp_path, overrides={"views_per_step": str(number)}
+        )
+        (run,) = plan_runs(settings, lambda line: None).runs.values()
+        documents.append((run.document["config"]["method_config"], run.job.variant))
+    (first, plain), (second, variant) = documents
+    assert "views_per_step" not in first and plain == ""
+    assert second == {**first, "views_per_step": 2} and variant == "views_per_step=2"
+
+
 def test_a_scene_without_points_is_refused_before_anything_starts(scene_folder, tmp_path):
     bare = replace(read_scene(scene_folder), points=Points.empty())
     our_format.write(bare, tmp_path / "bare")
