@@ -110,9 +110,9 @@ class AnchorOptimizer:
             row = own.pop("global_features", None)
             add_gradients(total, {name: own[name] for name in own.keys() & self.adam.params.keys()})
             if row is not None and row.numel():
-                table = torch.zeros_like(self.model.global_features)
-                table[view.row] = row[0]
-                add_gradients(total, {"global_features": table})
+                every = torch.zeros_like(self.model.global_features)
+                every[view.row] = row[0]
+                add_gradients(total, {"global_features": every})
         for name, gradient in total.items():
             self.adam.params[name].grad = gradient
         for name, table in self.tables.items():
