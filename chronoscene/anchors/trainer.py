@@ -50,7 +50,7 @@ class Drawn(NamedTuple):
     """A view that is due in a step, with its photo."""
 
     number: int
-    """Of the view."""
+    """Number of the view."""
     draw: int
     """Number of the draw from 1, by which a random background is chosen."""
     photo: Tensor
@@ -60,7 +60,7 @@ class Drawn(NamedTuple):
 
 
 class ViewPass(NamedTuple):
-    """What a step has learned from one of its views."""
+    """Outcome of one view of a step."""
 
     result: BackwardPass
     drawn: DrawnView

@@ -16,7 +16,7 @@ gradients."""
 PROJECTED = 12
 """Numbers of a projected Gaussian: centre 2, conic 3, depth 1, radii 2, opacity 1, colour 3."""
 PROJECTED_GRADIENTS = 9
-"""Those of them that have a gradient: centre, conic, opacity and colour."""
+"""Numbers of these that have a gradient: centre, conic, opacity and colour."""
 TILES = 4
 """Tiles of 16 x 16 pixels that a Gaussian touches, on average."""
 TILE_ENTRY = 24

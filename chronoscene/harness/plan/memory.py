@@ -49,7 +49,7 @@ class PhotoNeeds:
     largest: int
     """One photo at the evaluation size."""
     pixels: int
-    """Of that photo."""
+    """Number of pixels of that photo."""
     decoding: int
     """A file while it is decoded, at most."""
     decoders: int

@@ -27,7 +27,8 @@ PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 
 
 NOT_FINITE_LIMIT = 50
-"""Steps of a view in a row without a finite loss and finite gradients that end a training."""
+"""Steps in a row without a finite loss and finite gradients that end a training; one of several
+views counts as so many."""
 
 _REMEDY = (
     "lower the learning rates, or take preset paper-scaled instead of paper, if the method has "

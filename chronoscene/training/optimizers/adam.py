@@ -36,7 +36,7 @@ TINY_SQUARE = float32(1e-37)
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """What becomes of moments and learning rates in one step from the sum of several gradients.
+    """Scale of learning rates and moments in a step from the sum of several gradients.
 
     A step of n views shall move the model about as far as n steps of one view do. If gradients of
     different views are independent, that takes the rate times sqrt(n), as Adam divides by the root
