@@ -9,7 +9,7 @@ from typing import TypeVar
 import numba
 
 from chronoscene.kernels.runtime import set_threads
-from chronoscene.kernels.thread_pool import num_workers
+from chronoscene.kernels.thread_pool import num_workers, spare_pools, use_pool
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -37,12 +37,14 @@ def side_by_side(function: Callable[[Item], Result], items: Sequence[Item]) -> l
     if workers < 2 or not _may_share():
         return [function(item) for item in items]
 
-    def call(item: Item) -> Result:
-        set_threads(threads // workers)  # of this thread
-        return function(item)
+    pools = iter(spare_pools(workers))
 
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(call, items))
+    def begin() -> None:
+        set_threads(threads // workers)  # of this thread
+        use_pool(next(pools))
+
+    with ThreadPoolExecutor(workers, initializer=begin) as executor:
+        return list(executor.map(function, items))
 
 
 def _may_share() -> bool:

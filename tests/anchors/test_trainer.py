@@ -14,6 +14,7 @@ from torch import Tensor
 from benchmarks.training.generated import make, training_set
 from chronoscene.anchors.optimizer import AnchorOptimizer
 from chronoscene.anchors.trainer import AnchorTrainer, Drawn
+from chronoscene.kernels import side_by_side
 from chronoscene.methods.interface import Skipped
 from chronoscene.rasterizer import rasterize
 from chronoscene.training.drawing import camera_centre_tensor, camera_tensors
@@ -116,6 +117,16 @@ def test_a_step_learns_from_the_sum_of_the_losses(monkeypatch: pytest.MonkeyPatc
         single = torch.stack([view[name].double() for view in alone])
         assert (found[name] - single.sum(0)).abs().max() < SUM * single.abs().max(), name
         assert (single.sum(0) - single[0]).abs().max() > 0.1 * largest, "the others count"
+
+
+def test_views_with_several_threads_each_give_the_same_bits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    results = []
+    for threads in (1, 4):
+        monkeypatch.setattr(side_by_side, "num_workers", lambda count=threads: count)
+        results.append(trainer_of(views_per_step=2).snapshot().tensors())
+    assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
 
 
 def test_views_that_are_skipped_take_no_part(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ import pytest
 from chronoscene.kernels import side_by_side as module
 from chronoscene.kernels.runtime import available_threads, set_threads
 from chronoscene.kernels.side_by_side import side_by_side
+from chronoscene.kernels.thread_pool import launch
 
 
 @pytest.fixture(autouse=True)
@@ -46,6 +47,23 @@ def test_otherwise_the_caller_does_it(
     threads = set_threads(threads)
     found = side_by_side(look, range(items))
     assert found == [(item, threading.get_ident(), threads) for item in range(items)]
+
+
+def test_each_thread_has_helpers_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two calls on four threads, each runs kernels on two, at the same time."""
+    if available_threads() < 2:
+        pytest.skip("one processor only")
+    monkeypatch.setattr(module, "_may_share", lambda: True)
+    monkeypatch.setattr(module, "num_workers", lambda: 4)
+    meeting = threading.Barrier(4, timeout=30)
+
+    def kernel(worker: int, control: object) -> None:
+        meeting.wait()
+
+    side_by_side(lambda item: launch(kernel, 2), [0, 1])
+    threads = threading.active_count()
+    side_by_side(lambda item: launch(kernel, 2), [0, 1])
+    assert threading.active_count() == threads  # the helpers stay
 
 
 def test_an_error_reaches_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
