@@ -96,9 +96,6 @@ class RowAdam:
     def fetch(self, rows: Tensor) -> Tensor:
         return fetch_together([(self, rows)])[0]
 
-    def gradient(self) -> Tensor | None:
-        return None if self.fetched is None else self.fetched[1].grad
-
     def step(self, rate: float) -> None:
         step_together([(self, rate)])
 
