@@ -1,6 +1,6 @@
 """The task ``matches``: pairs of photos, verified matches, held-out tracks. Worker process only.
 
-A `Matcher` gives the matches (`nearest.mutual_matches`), and COLMAP verifies them by geometry.
+A `Matcher` gives the matches (`epipolar.plausible_matches`), and COLMAP verifies them by geometry.
 Matches that are in the database already are verified as they are, those of a given file among them
 (`given.tasks.import_matches`); verified pairs are kept.
 """
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import SEED, quiet, read_pairs, write_pairs
+from chronoscene.registration.features.epipolar import Placed, plausible_matches
 from chronoscene.registration.features.given.tasks import (
     import_matches,
     load_features,
@@ -25,7 +26,7 @@ from chronoscene.registration.features.given.tasks import (
     matches_of,
 )
 from chronoscene.registration.features.holdout import hold_out
-from chronoscene.registration.features.nearest import Descriptors, mutual_matches
+from chronoscene.registration.features.nearest import Descriptors
 from chronoscene.registration.features.pairs import choose_pairs
 
 BATCH = 64  # Pairs
@@ -74,7 +75,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     verification.ransac.random_seed = SEED
     listed = Path(arguments["scratch"]) / "batch.txt"
     given = arguments.get("given")
-    pairwise, load = (matcher(given), load_features) if given else (mutual_matches, load_sift)
+    pairwise, load = (matcher(given), load_features) if given else (plausible_matches, load_placed)
     for first in range(0, len(left), BATCH):
         report("pairs", len(pairs) - len(left) + first, len(pairs))
         found = store_matches(database, left[first : first + BATCH], pairwise, threads, load)
@@ -100,6 +101,12 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 def load_sift(opened: pycolmap.Database, image_id: int) -> Descriptors:
     """Read SIFT descriptors."""
     return Descriptors.of(opened.read_descriptors(image_id).data)
+
+
+def load_placed(opened: pycolmap.Database, image_id: int) -> Placed:
+    """Read SIFT descriptors and the pixels of their keypoints."""
+    keypoints = np.asarray(opened.read_keypoints(image_id), np.float64)[:, :2]
+    return load_sift(opened, image_id), np.ascontiguousarray(keypoints)
 
 
 def store_matches(

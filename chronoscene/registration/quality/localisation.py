@@ -72,7 +72,7 @@ def localise(rays: TrackRays, placed: PlacedPoints) -> Localisation | str:
             noise.append(_variance(rays.where(mine[used]), xyz[mine[used]], pose))
     if not poses:
         return f"none of {len(images)} images could be localised from the other period"
-    angle = np.array([rotation_angle(new[:3, :3] @ old[:3, :3].T) for old, new in poses])
+    angle = rotation_angle(np.stack([new[:3, :3] @ old[:3, :3].T for old, new in poses]))
     moved = np.array(
         [np.linalg.norm(camera_centre(new) - camera_centre(old)) for old, new in poses]
     )
