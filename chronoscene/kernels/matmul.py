@@ -4,8 +4,8 @@ A matrix is ``(memory, start, row)``, memory as in `memory`, with the distance b
 factor is ``(memory, start, row, step)`` with the distance between columns too, so that it can be
 read transposed. Lengths are padded to `PADDING`, so there are no remainders.
 
-Numbers are float32, or pairs of whole numbers of 16 bits, or four of 8 bits, whose products are summed
-in 32 bits.
+Numbers are float32, or pairs of whole numbers of 16 bits, or fours of 8 bits, whose products are
+summed in 32 bits.
 """
 
 from __future__ import annotations

@@ -28,6 +28,8 @@ class Excess:
     value: float
     low: float
     """Lower bound, from the spread over the images."""
+    noise: float
+    """What noise explains, by the median."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +100,9 @@ def _excess(size: Array, noise: Array) -> Excess:
     middle = float(np.median(beyond))
     spread = SIGMA * float(np.median(np.abs(beyond - middle))) / np.sqrt(len(size))
     return Excess(
-        value=float(np.sqrt(max(0.0, middle))), low=float(np.sqrt(max(0.0, middle - 2 * spread)))
+        value=float(np.sqrt(max(0.0, middle))),
+        low=float(np.sqrt(max(0.0, middle - 2 * spread))),
+        noise=float(np.sqrt(np.median(noise))),
     )
 
 

@@ -119,9 +119,7 @@ def test_strong_features_come_first_and_of_each_kind_the_largest(tmp_path: Path)
     assert (keypoints[end:, 0] > 150).mean() > 0.5
 
 
-def test_one_pass_gives_the_features_of_two(
-    texture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_pass_gives_the_features_of_two(texture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = sift_features(texture, max_image_size=1600, max_features=4096)
     monkeypatch.setattr(sift, "SINGLE_PASS", 0)
     two = sift_features(texture, max_image_size=1600, max_features=4096)
