@@ -31,7 +31,6 @@ def test_matches_that_are_stored_are_verified_and_not_computed_again(tmp_path: P
     arguments = {
         "database": path,
         "pairs": str(tmp_path / "pairs.txt"),
-        "scratch": str(tmp_path),
         "threads": 1,
     }
     found = match(arguments, lambda *progress: None)
