@@ -354,14 +354,17 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
     if isinstance(pair.surfaces, SurfaceDistance):
         shift = pair.surfaces.shift
         if shift.low > 0:
-            yield from _check("clouds", 100 * shift.value / certificate.extent, place)
+            against = list(_check("clouds", 100 * shift.value / certificate.extent, place))
+            yield from against or _contradiction(pair, place)
         yield from _check("open", 100 * shift.high / certificate.extent, place)
         yield from _check("surfaces", pair.surfaces.beyond, place)
+
+
+def _contradiction(pair: PairFigures, place: str) -> Iterator[Objection]:
+    """Judge surfaces that are shifted by less than the limit, but against the matches."""
     if _contradicted(pair):
-        yield Objection(
-            "doubtful", "clouds", place, "the surfaces contradict the matches (chi-square, 99 %)",
-            THRESHOLDS["clouds"].why, _LOOK,
-        )  # fmt: skip
+        found = "the surfaces are shifted, and contradict the matches (chi-square, 99 %)"
+        yield Objection("doubtful", "clouds", place, found, THRESHOLDS["clouds"].why, _LOOK)
 
 
 def _contradicted(pair: PairFigures) -> bool:

@@ -419,17 +419,20 @@ def test_three_localised_images_of_both_periods_confirm() -> None:
 
 
 @pytest.mark.parametrize("tracks", ["by_all", "misalignment"])
-def test_surfaces_that_contradict_the_matches_are_a_doubt(tracks: str) -> None:
+def test_shifted_surfaces_that_contradict_the_matches_are_a_doubt(tracks: str) -> None:
     both = (Interval(0.03, 0.0, 0.06),) * 2
-    certificate = with_part(made(), "surfaces", motion=cast(Any, "some motion"))
+    shifted = Interval(0.07, 0.001, 0.2)
+    certificate = with_part(made(), "surfaces", motion=cast(Any, "some motion"), shift=shifted)
     certificate = with_pair(certificate, by_ties_and_surfaces=both, independent=both)
     assert judge(certificate).level == "pass"
     without = "by_ties_and_surfaces" if tracks == "by_all" else "independent"
     verdict = judge(with_pair(certificate, **{without: None}))
     assert found(verdict) == [("clouds", "doubtful")]
-    # They contradict nothing where the tracks are too few to measure.
+    # They contradict nothing where the tracks are too few to measure, or they may not be shifted.
     few = with_pair(certificate, **{without: None, tracks: "too few"})
     assert "clouds" not in {check for check, _ in found(judge(few))}
+    still = with_part(certificate, "surfaces", shift=Interval(0.07, 0.0, 0.2))
+    assert judge(with_pair(still, **{without: None})).level == "pass"
 
 
 def test_held_out_tracks_beyond_the_limit_fail_with_the_estimate_of_all_ties() -> None:
