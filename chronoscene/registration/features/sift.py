@@ -32,10 +32,6 @@ of COLMAP's threshold, by which OpenCV finds as many features as COLMAP does."""
 EDGE_THRESHOLD = 10.0  # COLMAP's
 LENGTH = 512.0  # Of a descriptor, as COLMAP stores it
 
-SINGLE_PASS = 1_000_000
-"""Pixels up to which the descriptors of all features take less time than another pyramid for those
-that are kept: detailed photos have one in 50 to 100 pixels."""
-
 PYRAMID_BYTES = 240
 """Memory for a pixel of the photo: four pixels after enlarging, 6 + 5 images of four bytes in each
 octave, and a third more for the smaller octaves."""
@@ -74,22 +70,14 @@ def sift_features(
         edgeThreshold=EDGE_THRESHOLD,
         enable_precise_upscale=True,  # otherwise, positions are off by a quarter of a pixel
     )
-    where = None if mask is None else mask.astype(np.uint8)
-    histograms = None
-    if grey.size <= SINGLE_PASS:
-        found, histograms = sift.detectAndCompute(grey, where)
-    else:
-        found = sift.detect(grey, where)
+    found = sift.detect(grey, None if mask is None else mask.astype(np.uint8))
     # OpenCV divides thresholds, and so responses, by the layers of an octave.
     faint = np.array([k.response for k in found]) < STRONG / sift.getNOctaveLayers()
     kept = np.lexsort((np.array([-k.size for k in found]), faint))[:max_features]
     if not len(kept):
         return np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8)
-    found = [found[i] for i in kept]
-    if histograms is None:
-        found, histograms = sift.compute(grey, found)
-    else:
-        histograms = histograms[kept]
+    # Another pyramid takes less time than descriptors of all that detailed photos have.
+    found, histograms = sift.compute(grey, [found[i] for i in kept])
     zoom = width / grey.shape[1], height / grey.shape[0]
     return _in_colmap(found, zoom), root_sift(np.asarray(histograms, np.float32))
 

@@ -10,7 +10,6 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features import sift
 from chronoscene.registration.features.sift import (
     MEMORY,
     PYRAMID_BYTES,
@@ -117,14 +116,6 @@ def test_strong_features_come_first_and_of_each_kind_the_largest(tmp_path: Path)
     (end,) = np.flatnonzero(np.diff(sizes) > 1e-4) + 1
     assert (keypoints[:end, 0] < 170).mean() > 0.8
     assert (keypoints[end:, 0] > 150).mean() > 0.5
-
-
-def test_one_pass_gives_the_features_of_two(texture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = sift_features(texture, max_image_size=1600, max_features=4096)
-    monkeypatch.setattr(sift, "SINGLE_PASS", 0)
-    two = sift_features(texture, max_image_size=1600, max_features=4096)
-    for first, second in zip(one, two, strict=True):
-        np.testing.assert_array_equal(first, second)
 
 
 def test_the_first_are_kept(texture: Path) -> None:
