@@ -69,7 +69,7 @@ def near_epipolar_lines(a: Array, b: Array) -> Mask:
         return everything
     if found is None or found.shape != (3, 3):
         return everything
-    distance = _sampson(found, a, b)
+    distance = _sampson(np.asarray(found, np.float64), a, b)
     agreeing = distance < MAX_PIXELS
     count = int(agreeing.sum())
     if count < MIN_INLIERS and len(a) < MANY:
