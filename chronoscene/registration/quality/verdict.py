@@ -200,7 +200,9 @@ VAGUE = 1.5
 """Noise of a localised image, in units of the limits, beyond which its error counts only where the
 images agree on it."""
 FEW_LOCALISED = 3  # Images that surfaces and ties need for confirmation, of both periods together
-MARGIN = 0.8  # Of the limits, within which an interval must end that other evidence confirms
+MARGIN = 0.8
+"""Share of the limits within which an interval must end that other evidence confirms, or that of a
+forward-facing capture."""
 
 MIN_TIES = 3  # Tie points, clicked ones for example, that two periods need to be linked
 
@@ -429,11 +431,13 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
             one = min(one, pair.independent[i], key=lambda x: x.high)
         loose, estimate = one.high * factor, one.value * factor
         beyond = loose > limit and estimate > limit  # Nothing confirms what this contradicts
-        if high > limit or beyond or (loose > 2 * limit and not confirmed):
+        # Forward-facing cameras leave depths open, which errors of their poses bend.
+        room = MARGIN * limit if certificate.facing else limit
+        if high > room or beyond or (loose > 2 * limit and not confirmed):
             t = THRESHOLDS[key]
             found = (
                 f"{t.what}: {estimate:.3g} {t.unit}, but up to {max(high, loose):.3g} cannot be "
-                f"ruled out; expected at most {limit:g}"
+                f"ruled out; expected at most {room:g}"
             )
             yield Objection("doubtful", key, place, found, t.why, t.todo)
 

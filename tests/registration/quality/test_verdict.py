@@ -412,6 +412,14 @@ def test_all_of_the_evidence_is_needed(change: Callable[[Certificate], Certifica
     assert {f.check for f in verdict.objections} == {"held_out", "occupied"}
 
 
+def test_forward_facing_captures_need_a_margin() -> None:
+    facing = replace(made(), facing=True)
+    for high, level in ((0.0799, "pass"), (0.0801, "doubtful")):
+        verdict = judge(with_part(facing, "by_all", shift=Interval(0.04, 0.0, high)))
+        assert verdict.level == level
+    assert "expected at most 0.16" in verdict.objections[0].found
+
+
 def test_three_localised_images_of_both_periods_confirm() -> None:
     one = with_part(confirmed(), "localised_a", images=1)
     assert judge(with_part(one, "localised_b", images=2)).level == "pass"
