@@ -4,7 +4,8 @@ A matrix is ``(memory, start, row)``, memory as in `memory`, with the distance b
 factor is ``(memory, start, row, step)`` with the distance between columns too, so that it can be
 read transposed. Lengths are padded to `PADDING`, so there are no remainders.
 
-Numbers are float32, or pairs of whole numbers of 16 bits whose products are summed in 32 bits.
+Numbers are float32, or pairs of whole numbers of 16 bits, or fours of 8 bits, whose products are
+summed in 32 bits.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from chronoscene.kernels.vectors import (
     FLOAT,
     LANES,
     MANY_REGISTERS,
+    emit_add_byte_products,
     emit_add_pair_products,
     emit_lanes,
     emit_multiply_add,
@@ -122,3 +124,6 @@ relu_product = _make_product(relu=True)
 """out = max(0, first + left @ right); nan stays nan."""
 pair_product = _make_product(emit_add_pair_products)
 """Matrix product of int32 matrices, each number a pair of int16: sums of the products of both."""
+byte_product = _make_product(emit_add_byte_products)
+"""As `pair_product`, each number four bytes, of the left without and of the right with a sign; only
+where there are `BYTE_PRODUCTS`."""

@@ -60,16 +60,19 @@ def emitted(signature: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any
     return define
 
 
-def _register_lanes() -> int:
-    """16 with AVX-512, 8 with AVX2, else 4. Honours NUMBA_CPU_FEATURES, as compiled code does."""
+def _features() -> list[str]:
+    """What the processor has. Honours NUMBA_CPU_FEATURES, as compiled code does."""
     features = config.CPU_FEATURES  # type: ignore[attr-defined]
     if features is None:
         features = binding.get_host_cpu_features().flatten()
-    names = str(features).split(",")
-    return 16 if "+avx512f" in names else 8 if "+avx2" in names else 4
+    return str(features).split(",")
 
 
-LANES = _register_lanes()  # Numbers of 32 bits in the widest register of the processor
+_NAMES = _features()
+LANES = 16 if "+avx512f" in _NAMES else 8 if "+avx2" in _NAMES else 4
+"""Numbers of 32 bits in the widest register of the processor: AVX-512, AVX2, or others."""
+BYTE_PRODUCTS = LANES == 16 and "+avx512vnni" in _NAMES
+"""True if the processor has `emit_add_byte_products`."""
 MANY_REGISTERS = LANES == 16 or platform.machine() in ("aarch64", "arm64")
 """32 vector registers, else 16."""
 
@@ -156,6 +159,14 @@ def emit_add_pair_products(builder: Any, a: Any, b: Any, c: Any) -> Any:
     high = builder.mul(*(builder.ashr(x, half) for x in (a, b)))
     low = builder.mul(*(builder.ashr(builder.shl(x, half), half) for x in (a, b)))
     return builder.add(c, builder.add(low, high))
+
+
+def emit_add_byte_products(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """c plus the products of four bytes of each lane, of a without and of b with a sign."""
+    kind = ir.FunctionType(c.type, [c.type] * 3)
+    name = "llvm.x86.avx512.vpdpbusd.512"
+    multiply = cgutils.get_or_insert_function(builder.module, kind, name)
+    return builder.call(multiply, [c, a, b])
 
 
 def _like(*kinds: Any) -> Any:

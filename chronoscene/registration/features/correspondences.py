@@ -116,7 +116,6 @@ def _matches(inputs: PhotoInputs, context: Context, given: Mapping[str, Any]) ->
     places = {
         "database": str(context.database),
         "pairs": str(context.work / "pairs.txt"),
-        "scratch": str(context.work),
         "out": str(context.mapping_database),
         "held_out": str(context.held_out),
         "threads": context.threads,

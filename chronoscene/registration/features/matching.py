@@ -1,6 +1,6 @@
 """The task ``matches``: pairs of photos, verified matches, held-out tracks. Worker process only.
 
-A `Matcher` gives the matches (`nearest.mutual_matches`), and COLMAP verifies them by geometry.
+A `Matcher` gives the matches (`epipolar.plausible_matches`), and COLMAP verifies them by geometry.
 Matches that are in the database already are verified as they are, those of a given file among them
 (`given.tasks.import_matches`); verified pairs are kept.
 """
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features.database import SEED, quiet, read_pairs, write_pairs
+from chronoscene.registration.features.database import SEED, quiet, read_pairs
+from chronoscene.registration.features.epipolar import Placed, plausible_matches
 from chronoscene.registration.features.given.tasks import (
     import_matches,
     load_features,
@@ -25,7 +26,7 @@ from chronoscene.registration.features.given.tasks import (
     matches_of,
 )
 from chronoscene.registration.features.holdout import hold_out
-from chronoscene.registration.features.nearest import Descriptors, mutual_matches
+from chronoscene.registration.features.nearest import Descriptors
 from chronoscene.registration.features.pairs import choose_pairs
 
 BATCH = 64  # Pairs
@@ -56,7 +57,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Match and verify pairs of images, except those that are verified already.
 
     Arguments: ``database``, ``pairs`` (text file with two names a line), ``threads``,
-    ``scratch`` (folder), ``given`` (see `given.source.find_sources`; may be missing).
+    ``given`` (see `given.source.find_sources`; may be missing).
 
     Returns:
         Number of ``pairs``, of those ``verified``, of their ``inliers``, and of the pairs
@@ -67,25 +68,13 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     pairs = read_pairs(Path(arguments["pairs"]))
     _drop_others(database, pairs)
     left = _unverified(database, pairs)
-    options = pycolmap.FeatureMatchingOptions()
-    options.use_gpu = False
-    options.num_threads = threads = arguments["threads"]
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
-    listed = Path(arguments["scratch"]) / "batch.txt"
-    given = arguments.get("given")
-    pairwise, load = (matcher(given), load_features) if given else (mutual_matches, load_sift)
+    threads, given = arguments["threads"], arguments.get("given")
+    pairwise, load = (matcher(given), load_features) if given else (plausible_matches, load_placed)
     for first in range(0, len(left), BATCH):
         report("pairs", len(pairs) - len(left) + first, len(pairs))
-        found = store_matches(database, left[first : first + BATCH], pairwise, threads, load)
-        for least, share in INLIER_SHARES:
-            write_pairs(listed, [pair for pair, count in found.items() if count >= least])
-            found = {pair: count for pair, count in found.items() if count < least}
-            verification.ransac.min_inlier_ratio = share
-            pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
-            # COLMAP takes the matches that are in the database, and verifies them.
-            pycolmap.match_image_pairs(database, options, pairing, verification)
-    listed.unlink(missing_ok=True)
+        batch = left[first : first + BATCH]
+        store_matches(database, batch, pairwise, threads, load)
+        _verify(database, batch, threads)
     report("pairs", len(pairs), len(pairs))
     with pycolmap.Database.open(database) as opened:
         counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
@@ -102,18 +91,20 @@ def load_sift(opened: pycolmap.Database, image_id: int) -> Descriptors:
     return Descriptors.of(opened.read_descriptors(image_id).data)
 
 
+def load_placed(opened: pycolmap.Database, image_id: int) -> Placed:
+    """Read SIFT descriptors and the pixels of their keypoints."""
+    keypoints = np.asarray(opened.read_keypoints(image_id), np.float64)[:, :2]
+    return load_sift(opened, image_id), np.ascontiguousarray(keypoints)
+
+
 def store_matches(
     database: str,
     pairs: Sequence[tuple[str, str]],
     matcher: Matcher,
     threads: int,
     load: Loader = load_sift,
-) -> dict[tuple[str, str], int]:
-    """Store matches of pairs of images, in the order of their ids, unless they are stored.
-
-    Returns:
-        Number of matches of each pair.
-    """
+) -> None:
+    """Store matches of pairs of images, in the order of their ids, unless they are stored."""
     with pycolmap.Database.open(database) as opened:
         ids = {str(image.name): int(image.image_id) for image in opened.read_all_images()}
         ordered = {(a, b): (min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in pairs}
@@ -124,7 +115,42 @@ def store_matches(
         with ThreadPoolExecutor(threads) as pool:
             for pair, matches in zip(new, pool.map(matcher, first, second), strict=True):
                 opened.write_matches(*ordered[pair], matches)
-        return {pair: len(opened.read_matches(*ordered[pair])) for pair in pairs}
+
+
+def _verify(database: str, pairs: Sequence[tuple[str, str]], threads: int) -> None:
+    """Store the geometry of pairs of images by their matches, degenerate ones too."""
+    with pycolmap.Database.open(database) as opened:
+        images = {str(image.name): image for image in opened.read_all_images()}
+        cameras = {int(c.camera_id): c for c in opened.read_all_cameras()}
+        ordered = [
+            sorted((images[a], images[b]), key=lambda image: int(image.image_id)) for a, b in pairs
+        ]
+        ids = [(int(first.image_id), int(second.image_id)) for first, second in ordered]
+        used = sorted({i for pair in ids for i in pair})
+        points = {
+            i: np.ascontiguousarray(opened.read_keypoints(i)[:, :2], np.float64) for i in used
+        }
+        sides = [
+            [(cameras[image.camera_id], points[int(image.image_id)]) for image in pair]
+            for pair in ordered
+        ]
+        matches = [opened.read_matches(*pair) for pair in ids]
+        with ThreadPoolExecutor(threads) as pool:
+            found = list(pool.map(_geometry, sides, matches))
+        with pycolmap.DatabaseTransaction(opened):
+            for pair, geometry in zip(ids, found, strict=True):
+                opened.write_two_view_geometry(*pair, geometry)
+
+
+def _geometry(
+    sides: Sequence[tuple[pycolmap.Camera, NDArray[np.float64]]], matches: NDArray[np.uint32]
+) -> pycolmap.TwoViewGeometry:
+    """Verify the matches of two images by the camera and the keypoints of each."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = SEED
+    options.ransac.min_inlier_ratio = next(s for least, s in INLIER_SHARES if len(matches) >= least)
+    (camera_a, a), (camera_b, b) = sides
+    return pycolmap.estimate_two_view_geometry(camera_a, a, camera_b, b, matches, options)
 
 
 def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:

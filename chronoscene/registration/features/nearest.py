@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Mask
 from chronoscene.kernels.compilation import kernel
-from chronoscene.kernels.matmul import ROW_TILE, pair_product
-from chronoscene.kernels.vectors import LANES
+from chronoscene.kernels.matmul import ROW_TILE, byte_product, pair_product
+from chronoscene.kernels.vectors import BYTE_PRODUCTS, LANES
 
 Integers = NDArray[np.int32]
 
@@ -23,7 +23,13 @@ MAX_RATIO = 0.8
 
 MAX_DISTANCE = 0.7  # COLMAP's, in lengths of a descriptor, which is 512
 
-PAIRS = 64  # Pairs of numbers in a descriptor
+SIZE = 128  # Numbers in a descriptor
+
+_TYPE, _product = (np.int8, byte_product) if BYTE_PRODUCTS else (np.int16, pair_product)
+WORDS = SIZE * np.dtype(_TYPE).itemsize // 4  # Of 32 bits in a descriptor, as products read them
+
+MIDDLE = 128  # Subtracted from the numbers that are searched, so that they are bytes with a sign
+
 COLUMNS = 2 * LANES  # Descriptors that a product reads side by side
 CHUNK = 512  # Descriptors that a cache holds while all queries pass by; a multiple of COLUMNS
 NOWHERE = -(2**30)  # Minus the squared length of what fills up the last columns
@@ -38,21 +44,21 @@ class Descriptors:
 
     values: NDArray[np.uint8]
     """[N, 128]"""
-    doubled: Integers
-    """Twice the values, in pairs of int16, by groups of COLUMNS descriptors.
-    [groups, PAIRS, COLUMNS]"""
+    centred: Integers
+    """The values minus MIDDLE, packed into words, by groups of COLUMNS descriptors.
+    [groups, WORDS, COLUMNS]"""
     squares: Integers
     """Minus the squared length of each. [groups * COLUMNS]"""
 
     @classmethod
     def of(cls, values: NDArray[np.uint8]) -> Descriptors:
         groups = -(-len(values) // COLUMNS)
-        padded = np.zeros((groups * COLUMNS, 2 * PAIRS), np.int16)
-        padded[: len(values)] = values
-        doubled = (2 * padded).view(np.int32).reshape(groups, COLUMNS, PAIRS)
+        padded = np.zeros((groups * COLUMNS, SIZE), _TYPE)
+        padded[: len(values)] = values.astype(np.int16) - MIDDLE
+        centred = padded.view(np.int32).reshape(groups, COLUMNS, WORDS)
         squares = np.full(len(padded), NOWHERE, np.int32)
         squares[: len(values)] = -_squares(values)
-        return cls(values, np.ascontiguousarray(doubled.transpose(0, 2, 1)), squares)
+        return cls(values, np.ascontiguousarray(centred.transpose(0, 2, 1)), squares)
 
 
 def mutual_matches(first: Descriptors, second: Descriptors) -> NDArray[np.uint32]:
@@ -84,43 +90,49 @@ def _squares(values: NDArray[np.uint8]) -> Integers:
 
 def _nearest(queries: NDArray[np.uint8], searched: Descriptors) -> tuple[NDArray[np.int32], Mask]:
     """Index of the nearest descriptor, and True where it passes both tests. [Q], [Q]"""
-    padded = np.zeros((-(-len(queries) // ROW_TILE) * ROW_TILE, 2 * PAIRS), np.int16)
+    kind = np.dtype(f"u{np.dtype(_TYPE).itemsize}")
+    padded = np.zeros((-(-len(queries) // ROW_TILE) * ROW_TILE, SIZE), kind)
     padded[: len(queries)] = queries
     found = np.empty((3, len(padded)), np.int32)
-    _search(padded.view(np.int32), searched.doubled, searched.squares, *found)
+    _search(padded.view(np.int32), searched.centred, searched.squares, *found)
     index, *largest = found[:, : len(queries)]
-    least, second = (_squares(queries) - score for score in largest)
+    # |q - d|^2 = |q|^2 - 2 q MIDDLE - (2 q (d - MIDDLE) - |d|^2)
+    base = _squares(queries) - 2 * MIDDLE * queries.sum(axis=1, dtype=np.int32)
+    least, second = (base - score for score in largest)
     return index, (least <= _FARTHEST) & (_RATIO * least < second)
 
 
 @kernel
-def _search(queries, doubled, squares, index, most, next_most):  # type: ignore[no-untyped-def]
-    """Largest and second largest 2 q d - |d|^2 of each query, and the index of the largest.
+def _search(queries, centred, squares, index, most, next_most):  # type: ignore[no-untyped-def]
+    """Largest and second largest 2 q (d - MIDDLE) - |d|^2 of each query; index of the largest.
 
     Args:
-        queries: In pairs of int16. [Q, PAIRS]
-        doubled: See `Descriptors`.
+        queries: Packed into words. [Q, WORDS]
+        centred: See `Descriptors`.
         squares: See `Descriptors`.
         index: [Q]
         most: [Q]
         next_most: [Q]
     """
     scores = np.empty((ROW_TILE, CHUNK), np.int32)
+    nothing = np.zeros(COLUMNS, np.int32)
     lowest = np.int32(2 * NOWHERE)
     most[:] = next_most[:] = lowest
     for start in range(0, len(squares), CHUNK):
         count = min(CHUNK, len(squares) - start)
+        own = squares[start : start + count]
         for top in range(0, len(queries), ROW_TILE):
-            left = (queries, top * PAIRS, PAIRS, 1)
+            left = (queries, top * WORDS, WORDS, 1)
             for column in range(0, count, COLUMNS):
-                right = (doubled, (start + column) * PAIRS, COLUMNS)
-                first, out = (squares, start + column, 0), (scores, column, CHUNK)
-                pair_product(left, right, first, out, ROW_TILE, COLUMNS, PAIRS)
+                right = (centred, (start + column) * WORDS, COLUMNS)
+                first, out = (nothing, 0, 0), (scores, column, CHUNK)
+                _product(left, right, first, out, ROW_TILE, COLUMNS, WORDS)
             for i in range(top, top + ROW_TILE):
                 row = scores[i - top, :count]
                 best = lowest
-                for score in row:
-                    best = max(best, score)
+                for j in range(count):
+                    row[j] = 2 * row[j] + own[j]
+                    best = max(best, row[j])
                 if best <= most[i]:
                     next_most[i] = max(next_most[i], best)
                     continue

@@ -28,6 +28,8 @@ class Excess:
     value: float
     low: float
     """Lower bound, from the spread over the images."""
+    noise: float
+    """What noise explains, by the median."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,7 @@ def localise(rays: TrackRays, placed: PlacedPoints) -> Localisation | str:
             noise.append(_variance(rays.where(mine[used]), xyz[mine[used]], pose))
     if not poses:
         return f"none of {len(images)} images could be localised from the other period"
-    angle = np.array([rotation_angle(new[:3, :3] @ old[:3, :3].T) for old, new in poses])
+    angle = rotation_angle(np.stack([new[:3, :3] @ old[:3, :3].T for old, new in poses]))
     moved = np.array(
         [np.linalg.norm(camera_centre(new) - camera_centre(old)) for old, new in poses]
     )
@@ -98,7 +100,9 @@ def _excess(size: Array, noise: Array) -> Excess:
     middle = float(np.median(beyond))
     spread = SIGMA * float(np.median(np.abs(beyond - middle))) / np.sqrt(len(size))
     return Excess(
-        value=float(np.sqrt(max(0.0, middle))), low=float(np.sqrt(max(0.0, middle - 2 * spread)))
+        value=float(np.sqrt(max(0.0, middle))),
+        low=float(np.sqrt(max(0.0, middle - 2 * spread))),
+        noise=float(np.sqrt(np.median(noise))),
     )
 
 

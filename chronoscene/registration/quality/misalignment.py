@@ -7,7 +7,6 @@ follow from the residuals: a registration is as good as the largest motion they 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,12 +103,16 @@ class Motion:
 
     def displacement(self, similarity: Sim3) -> float:
         """Displacement of cameras or points, see `Misalignment.shift`."""
-        moved = np.linalg.norm(similarity.apply(self.centres) - self.centres, axis=1)
+        return float(self._displacements(_one(similarity))[0])
+
+    def _displacements(self, moves: _Moves) -> Array:
+        """`displacement` of each of several similarities. [D]"""
+        moved = np.linalg.norm(moves.apply(self.centres) - self.centres, axis=2)
         points, cameras = self.seen
         rays = points - cameras
-        deeper = (similarity.apply(points) - points) * rays
-        depth = np.abs(deeper.sum(axis=1)) / np.maximum(np.linalg.norm(rays, axis=1), 1e-300)
-        return max(float(np.median(moved)), float(np.median(depth)))
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
+        depth = np.abs(np.einsum("dni,ni->dn", moves.apply(points) - points, rays))
+        return np.asarray(np.maximum(np.median(moved, axis=1), np.median(depth, axis=1)))
 
     def about(self, middle: Array) -> Motion:
         """The same motion with parameters about another point."""
@@ -135,12 +138,33 @@ class Motion:
         similarity = self.similarity(self.step) if similarity is None else similarity
         rng = np.random.default_rng(0)
         steps = rng.multivariate_normal(np.zeros(7), self.covariance, DRAWS, method="eigh")
-        drawn = [_compose(step, similarity, self.middle) for step in steps]
-        noise = [self.similarity(step) for step in steps]
+        drawn = _composed(steps, similarity, self.middle)
+        noise = _composed(steps, Sim3.identity(), self.middle)
+        found = _one(similarity)
         return (
-            _interval(lambda m: rotation_angle(m.rotation), similarity, drawn, noise),
-            _interval(self.displacement, similarity, drawn, noise),
+            _interval(*(rotation_angle(moves.rotation) for moves in (found, drawn, noise))),
+            _interval(*(self._displacements(moves) for moves in (found, drawn, noise))),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moves:
+    """Several similarities, as `Sim3` is one: [D], [D, 3, 3], [D, 3]."""
+
+    scale: Array
+    rotation: Array
+    translation: Array
+
+    def apply(self, points: Array) -> Array:
+        """Transform points by each of them. [N, 3] -> [D, N, 3]"""
+        linear = self.scale[:, None, None] * self.rotation
+        return np.asarray(points @ linear.transpose(0, 2, 1) + self.translation[:, None])
+
+
+def _one(similarity: Sim3) -> _Moves:
+    return _Moves(
+        np.array([similarity.scale]), similarity.rotation[None], similarity.translation[None]
+    )
 
 
 def transfers(
@@ -301,15 +325,21 @@ def _sum(residual: Array, jacobian: Array, weight: Array) -> tuple[Array, Array]
 
 def _compose(step: Array, similarity: Sim3, middle: Array) -> Sim3:
     """``exp(step)`` about a point, after a similarity."""
+    moves = _composed(step[None], similarity, middle)
+    return Sim3(float(moves.scale[0]), moves.rotation[0], moves.translation[0])
+
+
+def _composed(steps: Array, similarity: Sim3, middle: Array) -> _Moves:
+    """`_compose` of each of several steps. [D, 7]"""
     from scipy.spatial.transform import Rotation
 
-    turn = Rotation.from_rotvec(step[3:6]).as_matrix()
-    grow = float(np.exp(np.clip(step[6], -1.0, 1.0)))
-    shift = middle + step[:3] - grow * turn @ middle
-    return Sim3(
+    turn = Rotation.from_rotvec(steps[:, 3:6]).as_matrix()
+    grow = np.exp(np.clip(steps[:, 6], -1.0, 1.0))
+    linear = grow[:, None, None] * turn
+    return _Moves(
         grow * similarity.scale,
         turn @ similarity.rotation,
-        grow * turn @ similarity.translation + shift,
+        linear @ (similarity.translation - middle) + middle + steps[:, :3],
     )
 
 
@@ -360,17 +390,22 @@ def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> A
     return np.asarray((1.0 / size if 0 < size < 1 else 1.0) * covariance)
 
 
-def _interval(
-    size: Callable[[Sim3], float], estimate: Sim3, drawn: Sequence[Sim3], noise: Sequence[Sim3]
-) -> Interval:
-    """Interval of a non-negative quantity; its lower end is the excess over noise alone."""
-    value = size(estimate)
-    high = float(np.percentile([size(m) for m in drawn], 97.5))
-    chance = float(np.percentile([size(m) for m in noise], 95))
-    return Interval(value, low=max(0.0, value - chance), high=max(value, high))
+def _interval(estimate: Array, drawn: Array, noise: Array) -> Interval:
+    """Interval of a non-negative quantity; its lower end is the excess over noise alone.
+
+    Args:
+        estimate: [1]
+        drawn: Of motions about the estimate. [D]
+        noise: Of motions about none. [D]
+    """
+    value, high = float(estimate[0]), float(np.percentile(drawn, 97.5))
+    return Interval(
+        value, low=max(0.0, value - float(np.percentile(noise, 95))), high=max(value, high)
+    )
 
 
-def rotation_angle(rotation: Array) -> float:
-    """Angle of a rotation in degrees, exact for small ones too. [3, 3]"""
-    axis = rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]
-    return float(np.degrees(np.arctan2(np.linalg.norm(axis), np.trace(rotation) - 1)))
+def rotation_angle(rotation: Array) -> Array:
+    """Angles of rotations in degrees, exact for small ones too. [..., 3, 3] -> [...]"""
+    axis = rotation[..., [2, 0, 1], [1, 2, 0]] - rotation[..., [1, 2, 0], [2, 0, 1]]
+    cosine = np.trace(rotation, axis1=-2, axis2=-1) - 1
+    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=-1), cosine))

@@ -113,9 +113,9 @@ THRESHOLDS: dict[str, Threshold] = {
     ),
     "excess": Threshold(
         what="held-out residual beyond the noise of matching, as an angle",
-        unit="degrees", doubtful=0.1, fail=0.4,
+        unit="degrees", doubtful=0.04, fail=0.4,
         why="errors that no similarity explains come from drift that deforms a period (doming), "
-        "or from a wrong camera",
+        "which turns images by twice as much, or from a wrong camera",
         todo="calibrate each date (--calibration per-period), or add oblique photos; otherwise "
         + _CONTROL,
     ),
@@ -196,7 +196,13 @@ FEW_AGREEING = 0.5  # Share of their observations that agrees
 FACING = 0.8
 """Share of the error of localised images that counts in forward-facing captures: turns and shifts
 of a camera make up for each other there."""
-MARGIN = 0.8  # Of the limits, within which an interval must end that other evidence confirms
+VAGUE = 1.5
+"""Noise of a localised image, in units of the limits, beyond which its error counts only where the
+images agree on it."""
+FEW_LOCALISED = 3  # Images that surfaces and ties need for confirmation, of both periods together
+MARGIN = 0.8
+"""Share of the limits within which an interval must end that other evidence confirms, or that of a
+forward-facing capture."""
 
 MIN_TIES = 3  # Tie points, clicked ones for example, that two periods need to be linked
 
@@ -350,19 +356,46 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
     if isinstance(pair.surfaces, SurfaceDistance):
         shift = pair.surfaces.shift
         if shift.low > 0:
-            yield from _check("clouds", 100 * shift.value / certificate.extent, place)
+            against = list(_check("clouds", 100 * shift.value / certificate.extent, place))
+            yield from against or _contradiction(pair, place)
         yield from _check("open", 100 * shift.high / certificate.extent, place)
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
-def _localised(found: Localisation, certificate: Certificate) -> float:
-    """The larger of both errors against its limit; it fails only as far as it is certain."""
-    turn, place = found.rotation_excess, found.centre_excess
-    share = FACING if certificate.facing else 1.0
-    likely, certain = (
-        share * max(r / _limit("rotation"), 100 * c / certificate.extent / _limit("shift"))
-        for r, c in ((turn.value, place.value), (turn.low, place.low))
+def _contradiction(pair: PairFigures, place: str) -> Iterator[Objection]:
+    """Judge surfaces that are shifted by less than the limit, but against the matches."""
+    if _contradicted(pair):
+        found = "the surfaces are shifted, and contradict the matches (chi-square, 99 %)"
+        yield Objection("doubtful", "clouds", place, found, THRESHOLDS["clouds"].why, _LOOK)
+
+
+def _contradicted(pair: PairFigures) -> bool:
+    """True if the similarity of the surfaces excludes that of the ties, or of held-out tracks."""
+    if isinstance(pair.surfaces, str) or pair.surfaces.motion is None:
+        return False
+    return any(
+        isinstance(tracks, Misalignment) and both is None
+        for tracks, both in (
+            (pair.by_all, pair.by_ties_and_surfaces),
+            (pair.misalignment, pair.independent),
+        )
     )
+
+
+def _localised(found: Localisation, certificate: Certificate) -> float:
+    """The larger of both errors against its limit; it fails only as far as it is certain.
+
+    An error far below the noise of the images counts only if they agree on it.
+    """
+    share = FACING if certificate.facing else 1.0
+    likely = certain = 0.0
+    for error, limit in (
+        (found.rotation_excess, _limit("rotation")),
+        (found.centre_excess, _limit("shift") * certificate.extent / 100),
+    ):
+        certain = max(certain, share * error.low / limit)
+        if error.low > 0 or error.noise < VAGUE * limit:
+            likely = max(likely, share * error.value / limit)
     bad = THRESHOLDS["localised"].fail
     assert bad is not None
     return certain if certain > bad else min(likely, bad)
@@ -371,7 +404,8 @@ def _localised(found: Localisation, certificate: Certificate) -> float:
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
     """Judge the alignment of two periods, and its uncertainty.
 
-    They are misaligned if the interval of all ties or of held-out tracks lies beyond the limit.
+    They are misaligned if the interval of all ties lies beyond the limit, or that of held-out
+    tracks and the estimate of all ties: one interval in twenty misses the truth by chance.
     They are aligned if the interval of the precise measurement (all ties, and the surfaces) ends
     below the limit, and an independent one (held-out tracks, and the surfaces) agrees: its interval
     ends below the limit, or its estimate lies below it and its interval ends below twice the limit.
@@ -390,18 +424,20 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
         limit, every = _limit(key), getattr(by_all, key)
         one = every if isinstance(held, str) else getattr(held, key)
         high = _precise(pair)[i].high * factor
-        if max(one.low, every.low) * factor > limit:
+        if max(every.low, min(one.low, every.value)) * factor > limit:
             yield from _check(key, max(one.value, every.value) * factor, place)
             continue
         if pair.independent is not None:
             one = min(one, pair.independent[i], key=lambda x: x.high)
         loose, estimate = one.high * factor, one.value * factor
         beyond = loose > limit and estimate > limit  # Nothing confirms what this contradicts
-        if high > limit or beyond or (loose > 2 * limit and not confirmed):
+        # Forward-facing cameras leave depths open, which errors of their poses bend.
+        room = MARGIN * limit if certificate.facing else limit
+        if high > room or beyond or (loose > 2 * limit and not confirmed):
             t = THRESHOLDS[key]
             found = (
                 f"{t.what}: {estimate:.3g} {t.unit}, but up to {max(high, loose):.3g} cannot be "
-                f"ruled out; expected at most {limit:g}"
+                f"ruled out; expected at most {room:g}"
             )
             yield Objection("doubtful", key, place, found, t.why, t.todo)
 
@@ -427,15 +463,15 @@ def _confirmed(certificate: Certificate, pair: PairFigures) -> bool:
     held, surfaces = pair.held_out, pair.surfaces
     if isinstance(pair.by_all, str) or isinstance(surfaces, str) or isinstance(held, str):
         return False
-    if isinstance(pair.misalignment, Misalignment) and pair.independent is None:
-        return False  # Surfaces contradict the held-out tracks
+    if _contradicted(pair):
+        return False
     local = (pair.localised_a, pair.localised_b)
     percent = 100 / certificate.extent
     turn, shift = _precise(pair)
     return (
         held.tracks >= FEW_TRACKS
         and held.agreeing >= FEW_AGREEING
-        and all(isinstance(x, Localisation) and x.images >= 3 for x in local)
+        and sum(x.images for x in local if isinstance(x, Localisation)) >= FEW_LOCALISED
         and percent * surfaces.shift.high <= _limit("shift")
         and turn.high <= MARGIN * _limit("rotation")
         and percent * shift.high <= MARGIN * _limit("shift")

@@ -261,7 +261,7 @@ def _similarity(pair: PairFigures) -> dict[str, Any] | None:
         return None
     return {
         "scale": found.similarity.scale,
-        "rotation_degrees": rotation_angle(found.similarity.rotation),
+        "rotation_degrees": float(rotation_angle(found.similarity.rotation)),
         "matrix": found.similarity.to_matrix().tolist(),
     }
 

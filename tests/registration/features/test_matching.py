@@ -28,12 +28,7 @@ def test_matches_that_are_stored_are_verified_and_not_computed_again(tmp_path: P
         stored = database.read_matches(*broken)
         database.delete_two_view_geometry(*broken)
     write_pairs(tmp_path / "pairs.txt", pairs)
-    arguments = {
-        "database": path,
-        "pairs": str(tmp_path / "pairs.txt"),
-        "scratch": str(tmp_path),
-        "threads": 1,
-    }
+    arguments = {"database": path, "pairs": str(tmp_path / "pairs.txt"), "threads": 1}
     found = match(arguments, lambda *progress: None)
     assert (found["pairs"], found["verified"], found["carried"]) == (3, 3, 2)
     with pycolmap.Database.open(path) as database:
