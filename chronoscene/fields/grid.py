@@ -111,7 +111,7 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         out = torch.zeros(int(ctx.levels[1][-1]), FEATURES)
         given = grads[0].contiguous().view(-1).numpy()
-        by_level = np.empty(len(given) + LANES, np.float32)
+        by_level = np.empty(len(given) + 2 * LANES, np.float32)
         rest = numba.get_num_threads(), by_level, out.view(-1).numpy()
         encode_backward(*ctx.given, given, *ctx.levels, *rest)
         return out, None, None

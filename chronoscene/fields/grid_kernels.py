@@ -13,7 +13,6 @@ from chronoscene.kernels.vectors import (
     LANES,
     absolute,
     any_lane,
-    make_splat,
     multiply_add,
     splat,
     to_float,
@@ -26,7 +25,7 @@ CORNERS = 8
 _TILE = 64  # Places whose gradients are sorted by level together
 ONE = float32(1)
 ZERO = float32(0)
-_load_pair, _splat_int, _load_places = make_load(2), make_splat("i32", LANES), make_load_columns(3, LANES)
+_load_pair, _load_places = make_load(2), make_load_columns(3, LANES)
 
 
 @inlined
@@ -106,14 +105,16 @@ def encode_backward(  # type: ignore[no-untyped-def]
         grads: Of the output of `encode_forward`. Flat [N, 2 L].
         tasks: Into how many tasks to divide the levels; does not change the result.
         by_level: Written: the gradients in the order [L, N, 2], which a level reads in turn.
-            Flat, with LANES numbers more.
+            Flat, with 2 LANES numbers more.
         out: Zeros, added to. Flat [E, 2].
     """
     levels = resolutions.shape[0]
     for tile in prange((count + _TILE - 1) // _TILE):
         for level in range(levels):
             for i in range(tile * _TILE, min(count, (tile + 1) * _TILE)):
-                store(by_level, 2 * (level * count + i), _load_pair(grads, 2 * (i * levels + level)))
+                store(
+                    by_level, 2 * (level * count + i), _load_pair(grads, 2 * (i * levels + level))
+                )
     for task in prange(tasks):
         rows, weights = empty(CORNERS * LANES, int32), empty(CORNERS * LANES, float32)
         for level in range(task, levels, tasks):
@@ -122,7 +123,7 @@ def encode_backward(  # type: ignore[no-untyped-def]
             for i in range(0, count, LANES):
                 at = 2 * (level * count + i)
                 some = absolute(load(by_level, at)) + absolute(load(by_level, at + LANES))
-                if not any_lane(ZERO < some):
+                if not any_lane(some > ZERO):
                     continue
                 cell, share = _locate(places, i, cells)
                 for corner in range(CORNERS):
