@@ -1,9 +1,10 @@
 """Scenes with a role, fixed by hashes: presets are tuned on some, methods are ranked on others.
 
-    python -m leaderboard.scenes FOLDER [NAME...] [--role ranking]
+    python -m leaderboard.scenes FOLDER [NAME...] [--role ranking] [--photos FOLDER]
 
 makes the generated ones in FOLDER, checks those that are there, and names those that differ from
-``scenes.toml``. A scene that cannot be generated is checked on request, by its name.
+``scenes.toml``. Of photos that may not be passed on, only the registered model is here: such a
+scene is made on request, by its name, of the photos in the folder of ``--photos``.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from chronoscene.formats import read_scene
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.scene.splits import split_hash
 from chronoscene.synth import SynthSettings, generate
+from leaderboard.photo_scenes import MODELS, make_scene
 
 ROLES = {
     "ranking": "a ranking scene: no trial of any preset has used it",
@@ -46,9 +48,9 @@ class FixedScene:
     views_hash: str
     """By `views_hash`."""
     synth: dict[str, Any] | None = None
-    """Settings that generate it; None if it is made by hand."""
+    """Settings that generate it; None if it cannot be generated."""
     made: str = ""
-    """Its source and the commands, if it is made by hand."""
+    """Photos and commands for one that is not."""
 
 
 @cache
@@ -70,16 +72,24 @@ def role_of(digest: str) -> str:
     return roles.get(digest, "a scene without a role in the table of scenes")
 
 
-def make(folder: Path, fixed: FixedScene) -> None:
-    """Generate a scene, unless its folder is there, and check its hashes.
+def make(folder: Path, fixed: FixedScene, photos: Path | None = None) -> None:
+    """Make a scene, unless its folder is there, and check its hashes.
+
+    Args:
+        folder: The scene, of which the name is that of its model.
+        fixed: What it must be.
+        photos: Folder of the photos, for a scene that is not generated.
 
     Raises:
-        SceneError: If it is absent and made by hand, or other than in the table.
+        SceneError: If photos are missing, or the scene is other than in the table.
     """
     if not folder.exists():
-        if fixed.synth is None:
+        if fixed.synth is not None:
+            generate(folder, SynthSettings(**fixed.synth))
+        elif photos is not None and (model := MODELS / f"{folder.name}.npz").is_file():
+            make_scene(model, photos, folder)
+        else:
             raise SceneError(folder, expected="this scene", found="nothing there", todo=fixed.made)
-        generate(folder, SynthSettings(**fixed.synth))
     scene = read_scene(folder)
     found = (scene_hash(scene), split_hash(scene))
     if found != (fixed.scene_hash, fixed.split_hash):
@@ -99,12 +109,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(known))
     parser.add_argument("--role", choices=ROLES)
+    parser.add_argument("--photos", type=Path, help="of a scene that cannot be generated")
     given = parser.parse_args(arguments)
     generated = [n for n, s in known.items() if s.synth and given.role in (None, s.role)]
     failed = 0
     for name in given.names or generated:
         try:
-            make(given.folder / name, known[check_choice("NAME", name, known)])
+            make(given.folder / name, known[check_choice("NAME", name, known)], given.photos)
             print(f"{given.folder / name}: {ROLES[known[name].role]}; hashes agree", flush=True)
         except ChronoSceneError as error:
             failed = 1

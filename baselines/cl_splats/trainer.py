@@ -13,8 +13,7 @@ from baselines.cl_splats.model import STRAYS, PeriodModel
 from chronoscene.gaussians.trainer import Due, GaussianTrainer
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.training.checkpoint import TrainingState, parts
-from chronoscene.training.exposure import Exposure
-from chronoscene.training.views import ViewSampler
+from chronoscene.training.views import is_due
 
 _EXPOSURES = "exposures"  # Name of the stored transforms of all periods
 
@@ -51,7 +50,8 @@ class CLSplatsTrainer(GaussianTrainer):
                 self.exposure.begin(exposure)
         start, end = self.bounds[self.stage : self.stage + 2]
         report = super().step(index, max(progress - start, 0.0) / (end - start))
-        if len(self.model.spheres) and (index + 1) % self.config.stray_interval == 0:
+        strays = is_due(index, report.views, self.config.stray_interval)
+        if len(self.model.spheres) and strays:
             self._prune_strays()
         return replace(report, primitives=len(self.model) + len(self.model.kept["means"]))
 
@@ -60,8 +60,7 @@ class CLSplatsTrainer(GaussianTrainer):
         self.stage, self.train = stage, self.stages[stage]
         self.model.period = self.train.views[0].period
         self.timeline = self.timeline_class(self.config, begin)
-        self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
-        self.exposure = Exposure(self.config.exposure, self.train, self.background.device)
+        self.begin_views()
         self.begin()
 
     @torch.no_grad()

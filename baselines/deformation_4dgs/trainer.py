@@ -28,10 +28,10 @@ class TwoStages(Timeline):
         before = self.config.coarse_until if self.is_fine(index, progress) else 0
         return super().moment(index, progress) - before
 
-    def at(self, index: int, progress: float) -> Due:
+    def at(self, index: int, progress: float, views: int = 1) -> Due:
         config = self.config
         degree = super().moment(index, progress) // config.sh_interval
-        return replace(super().at(index, progress), sh_degree=min(config.sh_degree, degree))
+        return replace(super().at(index, progress, views), sh_degree=min(config.sh_degree, degree))
 
 
 class DeformationTrainer(GaussianTrainer):

@@ -95,6 +95,7 @@ PARTS: tuple[Timed, ...] = (
     ("check of gradients", gradients, "all_finite"),
     ("density statistics", DensityControl, "collect"),
     ("density statistics", GradientStatistics, "add"),
+    ("sum of gradients", AnchorOptimizer, "learn_from"),
     ("Adam", AnchorOptimizer, "step"),
     ("Adam", Adam, "step"),
 )

@@ -38,8 +38,6 @@ class DirectPass(NamedTuple):
     splats: Splats
     """These Gaussians. [L]"""
     info: RasterInfo
-    global_gradient: Tensor
-    """Gradient of the global features. [1, G]"""
 
 
 @torch.no_grad()
@@ -54,7 +52,7 @@ def learn_directly(
     """Draw a view, compare it with its photo, and go back to the tensors of the model.
 
     Args:
-        seen: The visible anchors, see `AnchorOptimizer.seen`.
+        seen: The model of `AnchorOptimizer.seen`.
         inputs: What its decoder reads.
         view: The camera.
         photo: uint8 0..255. [H, W, 3]
@@ -84,7 +82,7 @@ def learn_directly(
     for tensor, gradient in zip(tensors, found, strict=True):
         if tensor.is_leaf:
             tensor.grad = gradient
-    return DirectPass(loss, outputs[1], splats, render.info, found[4])
+    return DirectPass(loss, outputs[1], splats, render.info)
 
 
 def _is_plain(seen: AnchorModel, inputs: DecodeInputs) -> bool:

@@ -24,6 +24,7 @@ from chronoscene.methods import PeriodSharing, TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
+from chronoscene.training.device_memory import device_memory
 from chronoscene.training.drawing import Splats, draw
 from chronoscene.training.method import SplattingMethod
 from chronoscene.training.periods import period_weights, with_new_periods
@@ -138,6 +139,13 @@ class AnchorMethod(SplattingMethod):
             feature_rows=self.feature_rows(train),
             merge_share=self.merge_share,
         )
+
+    def device_memory(self, points: int, periods: int, pixels: int) -> tuple[int, dict[str, int]]:
+        config, layout = self.config, AnchorLayout.of(self.config, periods)
+        features = layout.base_dim + periods * layout.period_dim
+        numbers = 3 * layout.offsets + features + 6
+        count = config.max_anchors or points
+        return count, device_memory(count, numbers, layout.offsets, pixels)
 
     def splats(self, view: View, period: float, appearance_period: float) -> Splats:
         model = self.model

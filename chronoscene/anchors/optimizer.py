@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,13 +13,30 @@ from chronoscene.anchors.blocks import own_blocks
 from chronoscene.anchors.density import AnchorRows
 from chronoscene.anchors.model import FIXED, PER_ANCHOR, TABLES, AnchorModel
 from chronoscene.training.checkpoint import parts
-from chronoscene.training.optimizers.adam import Adam, DenseTable, apply_updates
+from chronoscene.training.optimizers.adam import ONE_VIEW, Adam, DenseTable, Pace, apply_updates
 from chronoscene.training.optimizers.row_adam import (
     RowAdam,
     fetch_together,
     make_table,
     step_together,
 )
+from chronoscene.training.optimizers.summing import add_gradients, use_sum
+
+
+class SeenAnchors(NamedTuple):
+    """The anchors that a view sees, as it learns from them."""
+
+    model: AnchorModel
+    """A model of one period, whose trained tensors collect the gradients of this view alone."""
+    rows: dict[str, Tensor]
+    """Rows of each table that the model has copies of. int64 [M]"""
+    row: int
+    """Row of the global features."""
+
+    def gradients(self) -> dict[str, Tensor]:
+        """Return all gradients that there are, by the names of their tensors."""
+        tensors = self.model.tensors()
+        return {name: t.grad for name, t in tensors.items() if t.grad is not None}
 
 
 class AnchorOptimizer:
@@ -27,25 +45,29 @@ class AnchorOptimizer:
     Args:
         model: Trained in place; `snapshot` gives its present state.
         trained: Names of the tensors to train.
+        pace: By how many views the gradients of a step are.
     """
 
-    def __init__(self, model: AnchorModel, trained: Collection[str]) -> None:
+    def __init__(self, model: AnchorModel, trained: Collection[str], pace: Pace = ONE_VIEW) -> None:
         self.model = model.requires_grad()
         tensors = {n: t for n, t in model.tensors().items() if n in trained and t.numel() > 0}
         self.trained = tuple(tensors)
         """Names of the tensors that are trained and not empty."""
-        self.adam = Adam({name: t for name, t in tensors.items() if name not in TABLES})
+        self.adam = Adam({name: t for name, t in tensors.items() if name not in TABLES}, pace)
         self.tables: dict[str, RowAdam | DenseTable] = {
-            "offsets": make_table(model.offsets),
-            "features": make_table(model.features),
-            "blocks": make_table(model.blocks),
+            "offsets": make_table(model.offsets, pace),
+            "features": make_table(model.features, pace),
+            "blocks": make_table(model.blocks, pace),
             # Culling reads the scales of all anchors in every step.
-            "log_scales": DenseTable(model.log_scales),
+            "log_scales": DenseTable(model.log_scales, pace),
         }
         self._seen_layout = replace(model.layout, num_periods=1)
 
-    def seen(self, visible: Tensor, row: int) -> AnchorModel:
-        """Return the visible anchors with one of the features that vary: a model of one period."""
+    def seen(self, visible: Tensor, row: int) -> SeenAnchors:
+        """Return the visible anchors, with one row of the features that vary.
+
+        Several threads may ask at a time.
+        """
         model = self.model
         if model.layout.period_dim:
             blocks = model.block_rows[:, row].index_select(0, visible)
@@ -55,15 +77,17 @@ class AnchorOptimizer:
             blocks = rows.flatten()
         wanted = dict.fromkeys(PER_ANCHOR, visible) | {"blocks": blocks}
         fetched = self._fetch(wanted)
-        return type(model)(
+        heads = {n: type(head)(*map(_alias, head)) for n, head in model.heads.items()}
+        seen = type(model)(
             self._seen_layout,
             anchors=model.anchors.index_select(0, visible),
             **fetched,
             block_rows=rows,
-            global_features=model.global_features[row : row + 1],
-            heads=model.heads,
+            global_features=_alias(model.global_features[row : row + 1]),
+            heads=heads,
             used_offsets=None if model.used_offsets is None else model.used_offsets[visible],
         )
+        return SeenAnchors(seen, wanted, row)
 
     def _fetch(self, wanted: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Fetch rows of each table, by name."""
@@ -77,13 +101,25 @@ class AnchorOptimizer:
         copies = fetch_together([(table, rows) for _, table, rows in lazy]) if lazy else []
         return found | {name: copy for (name, _, _), copy in zip(lazy, copies, strict=True)}
 
-    def gradients(self) -> dict[str, Tensor]:
-        """Return all gradients that there are, by the names of their tensors."""
-        found = {name: table.gradient() for name, table in self.tables.items()}
-        return self.adam.gradients() | {n: grad for n, grad in found.items() if grad is not None}
+    @torch.no_grad()
+    def learn_from(self, views: Sequence[SeenAnchors]) -> None:
+        """Let `step` use the sum of the gradients of some views."""
+        total: dict[str, Tensor] = {}
+        for view in views:
+            own = view.gradients()
+            row = own.pop("global_features", None)
+            add_gradients(total, {name: own[name] for name in own.keys() & self.adam.params.keys()})
+            if row is not None and row.numel():
+                every = torch.zeros_like(self.model.global_features)
+                every[view.row] = row[0]
+                add_gradients(total, {"global_features": every})
+        for name, gradient in total.items():
+            self.adam.params[name].grad = gradient
+        for name, table in self.tables.items():
+            use_sum(table, [(view.rows[name], getattr(view.model, name)) for view in views])
 
     def step(self, rates: Mapping[str, float], *, resized: bool) -> None:
-        """Do one step of Adam.
+        """Do one step of Adam with the gradients of `learn_from`.
 
         After a round only the MLPs and global features move, as in the official code, where the
         anchors then have new tensors without gradients.
@@ -172,3 +208,8 @@ class AnchorOptimizer:
         for name, table in self.tables.items():
             setattr(model, name, table.load_state(parts(tensors, f"table.{name}")))
         self.adam.load_state(parts(tensors, "adam"))
+
+
+def _alias(tensor: Tensor) -> Tensor:
+    """Return a leaf with the same numbers in the same memory, and a gradient of its own."""
+    return tensor.detach().requires_grad_()

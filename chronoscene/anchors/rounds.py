@@ -26,6 +26,7 @@ from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.checkpoint import parts
 from chronoscene.training.gradients import centre_gradients, centres_count
+from chronoscene.training.views import is_due
 
 _MARGIN = 1e-9
 """Shares of the training this close are equal: progress is a quotient of rounded numbers."""
@@ -46,6 +47,8 @@ class DrawnView(NamedTuple):
     opacities: Tensor
     """[L]"""
     info: RasterInfo
+    block_gradient: Tensor | None
+    """Gradient of the blocks of the visible anchors, if there are any. [M, Fv]"""
 
 
 @dataclass(eq=False)
@@ -73,7 +76,7 @@ class DensityControl:
 
         Args:
             drawn: The view, after the backward pass.
-            loss: Of the step.
+            loss: Of the view.
             done: Share of the training that is over once this step is done.
         """
         config, model = self.config, self.optimizer.model
@@ -97,7 +100,7 @@ class DensityControl:
         visible, pixels = drawn.visible, drawn.view.width * drawn.view.height
         shown = torch.zeros(len(visible), dtype=torch.bool, device=visible.device)
         shown[drawn.positions // self.optimizer.model.layout.offsets] = True
-        if (gradient := self.optimizer.tables["blocks"].gradient()) is not None:
+        if (gradient := drawn.block_gradient) is not None:
             self.block_statistics.update(
                 visible, drawn.row, gradient, shown, loss=loss, pixels=pixels
             )
@@ -110,17 +113,19 @@ class DensityControl:
         model = self.optimizer.model
         return BlockStatistics(len(model), model.layout.num_periods, model.device)
 
-    def round(self, index: int, done: float) -> bool:
+    def round(self, index: int, views: int, done: float) -> bool:
         """Change the anchors if it is time to; return True if their rows have changed.
 
         Args:
-            index: Number of steps done before, from 0.
+            index: Number of views seen before this step.
+            views: Number of views of this step.
             done: Share of the training that is over once this step is done.
         """
-        resized = self._densify_if_due(index, done) or self._drop_if_due(done)
-        return self._merge_if_due(index, done) or resized
+        ends = is_due(index, views, self.config.density_interval)
+        resized = self._densify_if_due(ends, done) or self._drop_if_due(done)
+        return self._merge_if_due(ends, done) or resized
 
-    def _densify_if_due(self, index: int, done: float) -> bool:
+    def _densify_if_due(self, ends: bool, done: float) -> bool:
         """Grow and prune; return True if it was time to."""
         config = self.config
         if done >= config.density_until - _MARGIN:
@@ -128,7 +133,7 @@ class DensityControl:
             return False
         sign = 1.0 if config.first_round == "after" else -1.0
         started = done > config.density_from + sign * _MARGIN
-        if not started or (index + 1) % config.density_interval or self.statistics is None:
+        if not started or not ends or self.statistics is None:
             return False
         self.optimizer.flush()
         self._grow(self.statistics)
@@ -176,13 +181,13 @@ class DensityControl:
         return True
 
     @torch.no_grad()
-    def _merge_if_due(self, index: int, done: float) -> bool:
+    def _merge_if_due(self, ends: bool, done: float) -> bool:
         """Let periods share blocks, once growth is over; return True if it was time to."""
         statistics, model = self.block_statistics, self.optimizer.model
         if statistics is None:
             return False
         if done < self.config.density_until - _MARGIN:
-            if (index + 1) % self.config.density_interval == 0:
+            if ends:
                 statistics.fade()
             return False
         self.block_statistics = None

@@ -7,8 +7,9 @@ same bytes for any number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,27 +19,55 @@ from torch import Tensor
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.direct import learn_directly
 from chronoscene.anchors.model import AnchorModel
-from chronoscene.anchors.optimizer import AnchorOptimizer
+from chronoscene.anchors.optimizer import AnchorOptimizer, SeenAnchors
 from chronoscene.anchors.rounds import DensityControl, DrawnView
+from chronoscene.kernels.side_by_side import side_by_side
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
-from chronoscene.training.checkpoint import TrainingState, parts
-from chronoscene.training.devices import to_device
+from chronoscene.training.checkpoint import TrainingState, check_views, parts
+from chronoscene.training.devices import has_kernels, to_device
 from chronoscene.training.drawing import camera_centre_tensor, draw_in_training, step_background
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import (
     BackwardPass,
     collect_gradients,
+    joined,
     judge_gradients,
     mask_tensor,
 )
 from chronoscene.training.losses import mean_volume, training_loss
+from chronoscene.training.optimizers.adam import Pace
+from chronoscene.training.optimizers.summing import Part
 from chronoscene.training.schedules import learning_rates
-from chronoscene.training.views import ViewSampler
+from chronoscene.training.views import ViewSampler, count_views, views_of_step
 
 Learned = tuple[BackwardPass, Tensor, Tensor, RasterInfo]
 """Outcome, places [L] and opacities [L] of the Gaussians that are switched on, and details of the
 rasterization."""
+
+
+class Drawn(NamedTuple):
+    """A view that is due in a step, with its photo."""
+
+    number: int
+    """Number of the view."""
+    draw: int
+    """Number of the draw from 1, by which a random background is chosen."""
+    photo: Tensor
+    """uint8 [H, W, 3]"""
+    mask: Tensor | None
+    """bool [H, W]"""
+
+
+class ViewPass(NamedTuple):
+    """Outcome of one view of a step."""
+
+    result: BackwardPass
+    drawn: DrawnView
+    seen: SeenAnchors
+    """Has the gradients."""
+    exposure: list[Part]
+    """Has those of `Exposure`."""
 
 
 @dataclass(eq=False)
@@ -63,7 +92,8 @@ class AnchorTrainer:
 
     def __post_init__(self) -> None:
         model, train, seed = self.model, self.train, self.seed
-        self.optimizer = AnchorOptimizer(model, self.rates)
+        self.views = count_views(self.config.views_per_step)
+        self.optimizer = AnchorOptimizer(model, self.rates, Pace(self.views))
         self.rates = {name: self.rates[name] for name in self.optimizer.trained}
         self.density = DensityControl(
             self.config,
@@ -77,78 +107,101 @@ class AnchorTrainer:
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed, train.expect)
-        self.exposure = Exposure(self.config.exposure, train, model.device)
+        self.exposure = Exposure(self.config.exposure, train, model.device, Pace(self.views))
 
     def step(self, index: int, progress: float) -> StepReport:
-        """Render one training view, learn from it, and grow and prune where a round is due."""
-        done = self._progress_after(index, progress)
-        result = self._learn(self.sampler.next(), done)
-        resized = self.density.round(index, done)
-        if result.skipped is None:
+        """Render training views, learn from them, and grow and prune where a round is due.
+
+        The views of a step all meet the model as it was before. Each has threads of its own, unless
+        it learns an exposure or on a GPU; their gradients are added in the order of the views. With
+        one view to a step, a round drops its gradients of anchors, as the official code does; with
+        several, which would cost so many views, the anchors move before the round.
+        """
+        count = views_of_step(self.views, index, progress)
+        done = self._progress_after(index, count, progress)
+        due = [self._draw() for _ in range(count)]
+        if has_kernels(self.model.anchors) and not self.exposure.tables:
+            passes = side_by_side(self._learn, due)
+        else:
+            passes = [self._learn(drawn) for drawn in due]
+        learned = [view for view in passes if view.result.skipped is None]
+        for view in learned:
+            self.density.collect(view.drawn, view.result.loss, done)
+        if learned:
+            self.optimizer.learn_from([view.seen for view in learned])
+            self.exposure.use([view.exposure for view in learned])
+        if self.views == 1:
+            resized = self.density.round(index, count, done)
+            self._update(learned, done, resized=resized)
+        else:
+            self._update(learned, done, resized=False)
+            self.density.round(index, count, done)
+        self.optimizer.adam.zero_grad()
+        result = joined([view.result for view in passes])
+        return StepReport(result.loss, len(self.model), result.skipped, result.not_finite, count)
+
+    def _update(self, learned: Sequence[ViewPass], done: float, *, resized: bool) -> None:
+        """Do a step of all optimisers, unless no view counts."""
+        if learned:
             rates = learning_rates(self.rates, done, cooldown=self.config.cooldown)
             self.optimizer.step(rates, resized=resized)
             self.exposure.step(done)
-        self.optimizer.adam.zero_grad()
-        return StepReport(result.loss, len(self.model), result.skipped, result.not_finite)
 
-    def _progress_after(self, index: int, progress: float) -> float:
+    def _progress_after(self, index: int, count: int, progress: float) -> float:
         """Return the share of the training that is over once this step is done."""
-        return progress * (index + 1) / index if index > 0 else 1.0 / self.config.iterations
+        return progress * (index + count) / index if index > 0 else count / self.config.iterations
 
-    def _learn(self, number: int, done: float) -> BackwardPass:
-        """Draw a training view, and collect gradients and statistics."""
-        view, row = self.train.views[number], int(self.feature_rows[number])
-        photo = to_device(self.train.load_image(number), self.model.device)
-        mask = mask_tensor(self.train, number, self.model.device)
+    def _draw(self) -> Drawn:
+        """Draw the next view and load its photo."""
+        number, device = self.sampler.next(), self.model.device
+        photo = to_device(self.train.load_image(number), device)
+        return Drawn(number, self.sampler.drawn, photo, mask_tensor(self.train, number, device))
+
+    def _learn(self, due: Drawn) -> ViewPass:
+        """Draw a training view and collect gradients; the model and its optimiser stay."""
+        view, row = self.train.views[due.number], int(self.feature_rows[due.number])
         visible = self.model.visible(view)
         seen = self.optimizer.seen(visible, row)
-        plain = mask is None and not self.exposure.tables
-        learned = self._learn_directly(seen, view, row, photo) if plain else None
+        plain = due.mask is None and not self.exposure.tables
+        learned = self._learn_directly(seen, due) if plain else None
         if learned is None:
-            learned = self._learn_by_autograd(seen, number, photo, mask)
+            learned = self._learn_by_autograd(seen, due)
         result, positions, opacities, info = learned
-        if result.skipped is None:
-            drawn = DrawnView(view, row, mask, visible, positions, opacities, info)
-            self.density.collect(drawn, result.loss, done)
-        return result
+        drawn = DrawnView(
+            view, row, due.mask, visible, positions, opacities, info, seen.model.blocks.grad
+        )
+        return ViewPass(result, drawn, seen, self.exposure.parts())
 
     def _decode_arguments(self, seen: AnchorModel, view: TrainingView) -> tuple[Tensor, ...]:
         """Return period weights, camera centre and the numbers of all anchors."""
         everything = torch.arange(len(seen), device=seen.device)
         return self._one_period, camera_centre_tensor(view, seen.device), everything
 
-    def _learn_directly(
-        self, seen: AnchorModel, view: TrainingView, row: int, photo: Tensor
-    ) -> Learned | None:
+    def _learn_directly(self, seen: SeenAnchors, due: Drawn) -> Learned | None:
         """Learn from a view without autograd; None where that does not apply."""
+        config, view = self.config, self.train.views[due.number]
         with torch.no_grad():
-            inputs = seen.decode_inputs(*self._decode_arguments(seen, view))
-        number = self.sampler.drawn
-        background = step_background(self.background, self.config, seed=self.seed, number=number)
-        found = learn_directly(seen, inputs, view, photo, background, self.config)
+            inputs = seen.model.decode_inputs(*self._decode_arguments(seen.model, view))
+        background = step_background(self.background, config, seed=self.seed, number=due.draw)
+        found = learn_directly(seen.model, inputs, view, due.photo, background, config)
         if found is None:
             return None
-        if (table := self.model.global_features).numel():
-            table.grad = torch.zeros_like(table)
-            table.grad[row] = found.global_gradient[0]
-        result = judge_gradients(found.loss, found.info, self.optimizer.gradients())
+        result = judge_gradients(found.loss, found.info, seen.gradients())
         return result, found.positions, found.splats.opacities, found.info
 
-    def _learn_by_autograd(
-        self, seen: AnchorModel, number: int, photo: Tensor, mask: Tensor | None
-    ) -> Learned:
-        config, view = self.config, self.train.views[number]
-        splats, positions = seen.decode_active(*self._decode_arguments(seen, view))
+    def _learn_by_autograd(self, seen: SeenAnchors, due: Drawn) -> Learned:
+        config, view = self.config, self.train.views[due.number]
+        splats, positions = seen.model.decode_active(*self._decode_arguments(seen.model, view))
         raster = draw_in_training(
-            splats, view, self.background, config, seed=self.seed, number=self.sampler.drawn
+            splats, view, self.background, config, seed=self.seed, number=due.draw
         )
         loss = training_loss(
-            raster, photo, mask, number=number, exposure=self.exposure, config=config
+            raster, due.photo, due.mask, number=due.number, exposure=self.exposure, config=config
         )
         if config.scale_weight:
             loss = loss + config.scale_weight * mean_volume(splats.scales, splats.opacities)
         result = collect_gradients(
-            loss, raster.info, lambda: self.optimizer.gradients() | self.exposure.gradients(), mask
+            loss, raster.info, lambda: seen.gradients() | self.exposure.gradients(), due.mask
         )
         return result, positions, splats.opacities, raster.info
 
@@ -157,11 +210,13 @@ class AnchorTrainer:
         tensors, values = self.density.state()
         tensors |= self.optimizer.state()
         tensors |= {f"exposure.{name}": tensor for name, tensor in self.exposure.state().items()}
-        return TrainingState(tensors, values | {"views_drawn": self.sampler.drawn})
+        values |= {"views_drawn": self.sampler.drawn, "views_per_step": self.views}
+        return TrainingState(tensors, values)
 
     @torch.no_grad()
     def load_state(self, state: TrainingState) -> None:
         """Go on from what `state` gave, in a trainer that was made alike."""
+        check_views(state, self.views)
         self.optimizer.load_state(state.tensors)
         self.exposure.load_state(parts(state.tensors, "exposure"))
         self.density.load_state(state.tensors, state.values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -19,6 +20,7 @@ from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import META_FILE
+from chronoscene.training.device_memory import device_memory
 from chronoscene.training.drawing import Splats, draw
 from chronoscene.training.method import SplattingMethod
 
@@ -90,6 +92,11 @@ class GaussianMethod(SplattingMethod):
             background=self.background,
             learning_rates=self.learning_rates,
         )
+
+    def device_memory(self, points: int, periods: int, pixels: int) -> tuple[int, dict[str, int]]:
+        numbers = sum(math.prod(shape) for shape in self.shapes.values())
+        count = self.config.max_gaussians or points
+        return count, device_memory(count, numbers, 1, pixels)
 
     def splats(self, view: View, period: float, appearance_period: float) -> Splats:
         splats = self.model.splats(view, period)

@@ -24,16 +24,17 @@ from chronoscene.gaussians.mcmc import make_generator, noise, relocate
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
-from chronoscene.training.checkpoint import TrainingState, parts
+from chronoscene.training.checkpoint import TrainingState, check_views, parts
 from chronoscene.training.devices import to_device
 from chronoscene.training.drawing import Splats, draw_in_training
 from chronoscene.training.exposure import Exposure
-from chronoscene.training.gradients import collect_gradients, mask_tensor
+from chronoscene.training.gradients import BackwardPass, collect_gradients, joined, mask_tensor
 from chronoscene.training.losses import steady_mean, training_loss
-from chronoscene.training.optimizers.adam import Adam
+from chronoscene.training.optimizers.adam import Adam, Pace
+from chronoscene.training.optimizers.summing import Part, add_gradients
 from chronoscene.training.photometric import photometric_loss
 from chronoscene.training.schedules import cooled, log_linear
-from chronoscene.training.views import ViewSampler
+from chronoscene.training.views import ViewSampler, count_views, is_due, views_of_step
 
 # Keep random choices of a kind apart from those of others with the same seed
 _SPLIT_STREAM = 1
@@ -46,7 +47,7 @@ class Due:
     """Actions and settings of one training step."""
 
     moment: int
-    """Iteration of the schedule, from 1."""
+    """Iteration of the schedule, from 1; of several views, the first."""
     progress: float
     """Share of the training that is over."""
     sh_degree: int
@@ -78,8 +79,8 @@ class Timeline:
         done = round(progress * config.schedule_length) if config.stretch else index - self.begin
         return done + 1
 
-    def at(self, index: int, progress: float) -> Due:
-        """Return what is due at a step; arguments as in `chronoscene.methods.Method.step`."""
+    def at(self, index: int, progress: float, views: int = 1) -> Due:
+        """Return what is due at a step of some views; arguments as in `Method.step`."""
         config, moment = self.config, self.moment(index, progress)
         resets, resets_before = (m // config.reset_interval for m in (moment, self.last_moment))
         self.last_moment = moment
@@ -93,7 +94,7 @@ class Timeline:
             sh_degree=min(config.sh_degree, moment // config.sh_interval),
             position_lr=log_linear(decay, config.position_lr_initial, config.position_lr_final),
             collect=growing and adaptive,
-            densify=densify and (index + 1) % config.densify_interval == 0,
+            densify=densify and is_due(index, views, config.densify_interval),
             prune_large=moment > config.prune_large_from,
             # A squeezed schedule jumps over moments and may pass a multiple of the interval.
             reset=growing and adaptive and resets > resets_before,
@@ -121,48 +122,77 @@ class GaussianTrainer:
     """Function that splits Gaussians, a `density.Scatter`."""
 
     def __post_init__(self) -> None:
+        self.views = count_views(self.config.views_per_step)
+        self.pace = Pace(self.views)
         self.timeline = self.timeline_class(self.config)
-        self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
-        self.exposure = Exposure(self.config.exposure, self.train, self.background.device)
+        self.begin_views()
         self.begin()
+
+    def begin_views(self) -> None:
+        """Begin with the views of the training set, and without exposures."""
+        device = self.background.device
+        self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
+        self.exposure = Exposure(self.config.exposure, self.train, device, self.pace)
 
     def begin(self) -> None:
         """Forget the moments of the optimiser and the gradients seen for densification."""
-        self.optimizer = Adam({n: t.requires_grad_() for n, t in self.model.tensors().items()})
+        tensors = {n: t.requires_grad_() for n, t in self.model.tensors().items()}
+        self.optimizer = Adam(tensors, self.pace)
         self.statistics = GradientStatistics(len(self.model), self.background.device)
 
     def step(self, index: int, progress: float) -> StepReport:
-        """Render one training view, learn from it, and change the set of Gaussians where due."""
-        due = self.timeline.at(index, progress)
+        """Render training views, learn from them, and change the set of Gaussians where due.
+
+        The views of a step are drawn one after the other, from the model as it was before, and
+        their gradients are added. With one view to a step, densification drops its gradients, as
+        the released code does; with several, which would cost so many views, it comes after Adam.
+        """
+        count = views_of_step(self.views, index - self.timeline.begin, progress)
+        due = self.timeline.at(index, progress, count)
         # Higher than what is due at the start of a training that goes on with a model.
         self.model.sh_degree = max(due.sh_degree, self.model.sh_degree)
+        total: dict[str, Tensor] = {}
+        exposures: list[list[Part]] = []
+        passes = [self._learn(due, total, exposures) for _ in range(count)]
+        result = joined(passes)
+        for name, value in self.optimizer.params.items():
+            value.grad = total.get(name)
+        if exposures:
+            self.exposure.use(exposures)
+            self.exposure.step(progress)
+        if due.densify and self.views == 1:
+            self._densify(index, prune_large=due.prune_large)
+        self._update(due)
+        if due.densify and self.views > 1:
+            self._densify(index, prune_large=due.prune_large)
+        if not result.skipped:
+            self._move_at_random(index, due)
+        return StepReport(result.loss, len(self.model), result.skipped, result.not_finite, count)
+
+    def _learn(
+        self, due: Due, total: dict[str, Tensor], exposures: list[list[Part]]
+    ) -> BackwardPass:
+        """Render the next training view, and add its gradients and statistics unless skipped."""
         number = self.sampler.next()
         view = self.train.views[number]
         splats = self.splats(number)
-        drawn = self.sampler.drawn
         raster = draw_in_training(
-            splats, view, self.background, self.config, seed=self.seed, number=drawn
+            splats, view, self.background, self.config, seed=self.seed, number=self.sampler.drawn
         )
         mask = mask_tensor(self.train, number, self.background.device)
         self.optimizer.zero_grad()
-        loss, skipped, not_finite = collect_gradients(
+        result = collect_gradients(
             self.loss(raster, number, mask) + self._regulariser(splats),
             raster.info,
             lambda: self.optimizer.gradients() | self.exposure.gradients(),
             mask,
         )
-        if skipped:
-            self.optimizer.zero_grad()
-        else:
-            self.exposure.step(progress)
-        if due.collect and not skipped:
-            self.statistics.add(raster.info, view.width, view.height, mask)
-        if due.densify:
-            self._densify(index, prune_large=due.prune_large)
-        self._update(due)
-        if not skipped:
-            self._move_at_random(index, due)
-        return StepReport(loss, len(self.model), skipped, not_finite)
+        if not result.skipped:
+            add_gradients(total, self.optimizer.gradients())
+            exposures.append(self.exposure.parts())
+            if due.collect:
+                self.statistics.add(raster.info, view.width, view.height, mask)
+        return result
 
     def state(self) -> TrainingState:
         """Everything that the steps to come depend on; methods may add to it."""
@@ -175,19 +205,21 @@ class GaussianTrainer:
             "views_drawn": self.sampler.drawn,
             "last_moment": self.timeline.last_moment,
             "sh_degree": self.model.sh_degree,
+            "views_per_step": self.views,
         }
         return TrainingState(tensors, values)
 
     @torch.no_grad()
     def load_state(self, state: TrainingState) -> None:
         """Go on from what `state` gave, in a trainer that was made alike."""
+        check_views(state, self.views)
         model, statistics = self.model, self.statistics
         stored, adam, counts = (parts(state.tensors, n) for n in ("model", "adam", "statistics"))
         for name, tensor in model.parameters.items():
             model.parameters[name] = stored[name].to(tensor, copy=True).requires_grad_()
         for name, tensor in model.shared.items():
             tensor.copy_(stored[name])
-        self.optimizer = Adam(model.tensors())
+        self.optimizer = Adam(model.tensors(), self.pace)
         self.optimizer.load_state(adam)
         self.exposure.load_state(parts(state.tensors, "exposure"))
         statistics.sums = counts["sums"].to(statistics.sums)
@@ -232,7 +264,8 @@ class GaussianTrainer:
         """The random part of a step of the kind mcmc."""
         if self.config.densification != "mcmc":
             return
-        parameters, rate = self.model.parameters, self._rates(due)["means"]
+        # The noise of several steps adds up to this factor times that of one.
+        parameters, rate = self.model.parameters, self.pace.rate * self._rates(due)["means"]
         generator = make_generator(self.background.device, self.seed, _NOISE_STREAM, index)
         parameters["means"].add_(noise(parameters, rate, self.config, generator))
 

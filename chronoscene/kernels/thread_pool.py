@@ -197,12 +197,26 @@ class _Pool:
 
 
 _pool = _Pool()
+_spare: list[_Pool] = []
+_own = threading.local()
 
 
 def _forget() -> None:
     """Make a new pool in a forked child, which has none of its parent's threads."""
-    global _pool
-    _pool = _Pool()
+    global _pool, _spare
+    _pool, _spare = _Pool(), []
+
+
+def spare_pools(count: int) -> list[_Pool]:
+    """Return pools beside that of the program, always the same ones."""
+    while len(_spare) < count:
+        _spare.append(_Pool())
+    return _spare[:count]
+
+
+def use_pool(pool: _Pool) -> None:
+    """Let the launches of this thread use a pool that no other thread uses meanwhile."""
+    _own.pool = pool
 
 
 if hasattr(os, "register_at_fork"):
@@ -229,7 +243,7 @@ def launch(kernel: Kernel, jobs: int, *args: Any, phases: int = 1) -> None:
         phases: How many it has.
     """
     workers, control = min(num_workers(), jobs), new_control(phases)
-    pool = _pool
+    pool: _Pool = getattr(_own, "pool", _pool)
     if workers > 1 and pool.busy.acquire(blocking=False):
         try:
             pool.run(kernel, (control, *args), workers)

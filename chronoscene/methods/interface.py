@@ -107,6 +107,8 @@ class StepReport:
     the loss or a gradient was not."""
     not_finite: tuple[str, ...] = ()
     """Names of the tensors whose gradients were not finite, if the method knows them."""
+    views: int = 1
+    """Number of training views that the step has seen: by so many the iterations go on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +171,7 @@ class Method(Protocol):
         """Do one training step.
 
         Args:
-            index: Number of steps done before, from 0.
+            index: Number of iterations done before, from 0: steps, or their `StepReport.views`.
             progress: Share of the training that is over, 0..1. Every schedule (learning rates,
                 densification) follows it, so that a run that ends by the clock goes through the
                 same phases as one that ends after a number of iterations.
@@ -235,6 +237,22 @@ class Method(Protocol):
         Args:
             gaussians: What `to_gaussians` gave.
             views: Training views in which the result is to be right.
+        """
+
+    def device_memory(self, points: int, periods: int, pixels: int) -> tuple[int, dict[str, int]]:
+        """Estimate the memory that a training takes on a GPU.
+
+        Called before `setup`; only where a method can say it.
+
+        Args:
+            points: Number of sparse points.
+            periods: Number of periods.
+            pixels: Number of pixels of the largest photo.
+
+        Returns:
+            primitives: Number that the estimate is for: at which growth ends, or, without a limit,
+                that of the sparse points.
+            parts: Bytes by what takes them.
         """
 
     def permute(self, order: NDArray[np.int64]) -> None:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from chronoscene.compression.file import COMPRESSED_FILE, META_FILE, read_compressed
 from chronoscene.compression.file import TENSOR_FILE as TENSOR_FILE
-from chronoscene.errors import CheckpointError
+from chronoscene.errors import CheckpointError, ShapeError
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import replacing, sha256_of, write_text_atomic
 
@@ -44,6 +44,18 @@ def parts(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Return the tensors ``<prefix>.<name>``, by name."""
     start = f"{prefix}."
     return {k.removeprefix(start): t for k, t in tensors.items() if k.startswith(start)}
+
+
+def check_views(state: TrainingState, views: int) -> None:
+    """Refuse a training that began with another number of views to a step."""
+    begun = state.values.get("views_per_step", 1)  # earlier versions had one
+    if begun != views:
+        raise ShapeError(
+            "views_per_step",
+            expected=str(begun),
+            found=str(views),
+            todo="go on with as many threads as before, by which auto chose",
+        )
 
 
 def save_tensors(

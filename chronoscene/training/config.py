@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field, NonNegativeFloat, PositiveInt
 
 from chronoscene.checks import check_choice
 from chronoscene.methods import check_options
@@ -34,6 +34,10 @@ class SplattingConfig:
     """Add Gaussians where the sum over the pixels of a centre's absolute gradients is large, which
     does not cancel where a Gaussian is too large for what it shows (Ye et al. 2024, AbsGS). It is
     larger, and so must be the threshold: gsplat advises 0.0008 for 3DGS."""
+    views_per_step: PositiveInt | Literal["auto"] = 1
+    """Training views of one step, which moves the model by the sum of their gradients. Iterations
+    count views, so equal iterations mean equally many photos seen. ``auto``: by the number of
+    threads, see `chronoscene.training.views.count_views`; the result then depends on it."""
     random_background: bool = False
     """Train with another colour behind everything in each step, so that no Gaussian is missing
     where a photo shows that colour. Images are rendered with the usual background."""

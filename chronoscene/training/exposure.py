@@ -12,6 +12,7 @@ images differs (the identity, or a fit to half of each).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -23,7 +24,8 @@ from torch import Tensor
 from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import TrainingSet
 from chronoscene.training import devices
-from chronoscene.training.optimizers.adam import DenseTable
+from chronoscene.training.optimizers.adam import ONE_VIEW, DenseTable, Pace
+from chronoscene.training.optimizers.summing import Part, use_sum
 from chronoscene.training.periods import period_weights
 from chronoscene.training.schedules import log_linear
 from chronoscene.training.spherical_harmonics import C0
@@ -42,9 +44,13 @@ class Exposure:
         kind: Owner of each transform.
         train: Training views.
         device: Device of the tensors.
+        pace: By how many views the gradients of a step are.
     """
 
-    def __init__(self, kind: str, train: TrainingSet, device: str | torch.device) -> None:
+    def __init__(
+        self, kind: str, train: TrainingSet, device: str | torch.device, pace: Pace = ONE_VIEW
+    ) -> None:
+        self._pace = pace
         periods = np.array([view.period for view in train.views])
         self._kind, self._periods = kind, torch.from_numpy(periods).to(device)
         own = torch.arange(len(train.views), device=device)
@@ -59,7 +65,7 @@ class Exposure:
         """
         self._start = by_period
         starts = by_period[self._periods] if self._kind == "image" else by_period.clone()
-        self.tables = [] if self._kind == "none" else [DenseTable(starts)]
+        self.tables = [] if self._kind == "none" else [DenseTable(starts, self._pace)]
         """The transforms, a row for each; no table with kind ``none``. [R, 3, 4]"""
 
     def apply(self, image: Tensor, number: int) -> Tensor:
@@ -72,6 +78,15 @@ class Exposure:
         """Return the gradient of the transforms, if there is one."""
         gradient = self.tables[0].gradient() if self.tables else None
         return {} if gradient is None else {"exposure": gradient}
+
+    def parts(self) -> list[Part]:
+        """Return what `apply` has read of each table, for `use`."""
+        return [table.fetched for table in self.tables if table.fetched is not None]
+
+    def use(self, views: Sequence[Sequence[Part]]) -> None:
+        """Let `step` use the sum of the gradients of some views: what `parts` gave after each."""
+        for table, parts in zip(self.tables, zip(*views, strict=True), strict=True):
+            use_sum(table, parts)
 
     def step(self, progress: float) -> None:
         """Do one step of Adam; ``progress`` is the share of the training that is over."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -59,6 +59,18 @@ def judge_gradients(
         return BackwardPass(value, None)
     names = (name for name, tensor in found.items() if not all_finite([tensor]))
     return BackwardPass(value, "not finite", tuple(names))
+
+
+def joined(views: Sequence[BackwardPass]) -> BackwardPass:
+    """Return the outcome of a step of some views.
+
+    Views that are skipped take no part in it; a step of which none is left is skipped. The loss is
+    the mean of those that count.
+    """
+    counted = [view for view in views if view.skipped is None] or views
+    worst = [view for view in counted if view.skipped == "not finite"] or counted
+    loss = sum(view.loss for view in counted) / len(counted)
+    return worst[0]._replace(loss=loss)
 
 
 def centre_gradients(info: RasterInfo) -> Tensor:

@@ -34,6 +34,7 @@ from chronoscene.training.exposure import Exposure, exposed, of_period
 from chronoscene.training.filtering import adapt_to_plain
 from chronoscene.training.periods import with_new_periods
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, evaluate
+from chronoscene.training.views import count_views
 
 _EXPOSURE = "exposure"  # Name of the stored transforms
 
@@ -106,7 +107,8 @@ class SplattingMethod(ABC):
         """Rebuild the model from `stored_tensors` and `meta`."""
 
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
-        self.config = self.config.in_training_frame(train.training_from_world.scale)
+        config = self.config.in_training_frame(train.training_from_world.scale)
+        self.config = replace(config, views_per_step=count_views(config.views_per_step))
         background = np.array(train.background, np.float32)
         self.background = torch.from_numpy(background).to(device)
         self.meta = {

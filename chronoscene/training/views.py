@@ -1,15 +1,20 @@
-"""Views of training steps: their order, and smaller versions of their photos."""
+"""Views of training steps: their order and number, and smaller versions of their photos."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.kernels.thread_pool import num_workers
 from chronoscene.methods import TrainingView
 from chronoscene.methods.interface import nothing_ahead
+
+MOST_VIEWS = 4
+"""Views of a step with ``views_per_step=auto``, at most."""
 
 AHEAD = 32
 """Number of draws that are known before they are made."""
@@ -56,6 +61,36 @@ class ViewSampler:
             self._pools.pop(pool - 2, None)  # Draws that are known at one time are of two pools
             self._pools[pool] = generator.permutation(self.count)
         return int(self._pools[pool][position])
+
+
+def count_views(option: int | Literal["auto"]) -> int:
+    """Return the number of views of a step that an option asks for.
+
+    ``auto`` is one view up to two threads, where more bring nothing, then a view for every two
+    threads, and `MOST_VIEWS` at most: what more views save is less than what they cost in quality.
+    """
+    if option != "auto":
+        return option
+    threads = num_workers()
+    return 1 if threads <= 2 else min(threads // 2, MOST_VIEWS)
+
+
+def views_of_step(most: int, index: int, progress: float) -> int:
+    """Return the number of views of the next step: as many as usual, or what is left of a training.
+
+    Args:
+        most: The usual number.
+        index: Views seen before.
+        progress: Share of the training that is over.
+    """
+    if most == 1 or progress <= 0.0:
+        return most
+    return min(most, max(round(index / progress) - index, 1))
+
+
+def is_due(index: int, views: int, interval: int) -> bool:
+    """Return True if a multiple of an interval is among the views index + 1 .. index + views."""
+    return (index + views) // interval > index // interval
 
 
 def downscale_view(view: TrainingView, factor: int) -> TrainingView:

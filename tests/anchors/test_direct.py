@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from benchmarks.training.generated import make, training_set
-from chronoscene.anchors.trainer import AnchorTrainer
+from chronoscene.anchors.trainer import AnchorTrainer, Drawn
 from chronoscene.errors import ShapeError
 
 OPTIONS: list[dict[str, Any]] = [
@@ -30,13 +30,9 @@ def learn(trainer: AnchorTrainer, way: str) -> tuple[Any, dict[str, torch.Tensor
     number, row = 4, int(trainer.feature_rows[4])
     view, photo = trainer.train.views[number], torch.from_numpy(trainer.train.load_image(number))
     seen = trainer.optimizer.seen(trainer.model.visible(view), row)
-    if way == "direct":
-        found = trainer._learn_directly(seen, view, row, photo)
-    else:
-        found = trainer._learn_by_autograd(seen, number, photo, None)
-    gradients = trainer.optimizer.gradients()
-    trainer.optimizer.adam.zero_grad()
-    return found, gradients
+    due = Drawn(number, trainer.sampler.drawn, photo, None)
+    found = (trainer._learn_directly if way == "direct" else trainer._learn_by_autograd)(seen, due)
+    return found, seen.gradients()
 
 
 @pytest.mark.parametrize("options", OPTIONS)

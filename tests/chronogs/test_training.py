@@ -107,7 +107,7 @@ def rounds(config: ChronoGSConfig, train_set: TrainingSet, total: int) -> list[i
     return [
         index + 1
         for index in range(total)
-        if density._densify_if_due(index, trainer._progress_after(index, index / total))
+        if density.round(index, 1, trainer._progress_after(index, 1, index / total))
     ]
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.train import painted_balls
 from chronoscene.kernels.runtime import set_threads
@@ -30,6 +31,10 @@ OPTIONS = [
     ("chronogs", {"merge_share": 0.5, "density_interval": 8}),
     ("4dgs", {"exposure": "period", "cooldown": 0.5}),
     ("gs-w", {"reference": "period", "exposure": "image"}),
+    ("3dgs", {"views_per_step": 2, "densify_interval": 8}),
+    ("chronogs", {"views_per_step": 3, "density_interval": 8}),
+    ("scaffold-gs", {"views_per_step": 2, "exposure": "image"}),
+    ("cl-splats", {"views_per_step": 2}),
     ("3dgs", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
     ("gs-w", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
 ]
@@ -52,7 +57,11 @@ def start(name, data, **options):
 
 
 def train(method, start=0, stop=STEPS):
-    return [method.step(i, i / STEPS) for i in range(start, stop)]
+    reports = []
+    while start < stop:
+        reports.append(method.step(start, start / STEPS))
+        start += reports[-1].views
+    return reports
 
 
 def saved(method, folder):
@@ -67,12 +76,14 @@ def test_a_training_with_options_ends_the_same_when_interrupted(name, options, t
     whole = start(name, data, **options)
     reports = train(whole)
     first = start(name, data, **options)
-    train(first, 0, 17)
+    views = options.get("views_per_step", 1)
+    middle = 17 // views * views
+    train(first, 0, middle)
     (tmp_path / "training").mkdir()
     first.save_training(tmp_path / "training")
     second = start(name, data, **options)
     second.load_training(tmp_path / "training")
-    assert train(second, 17) == reports[17:]
+    assert train(second, middle) == reports[middle // views :]
     assert saved(second, tmp_path / "second") == saved(whole, tmp_path / "whole")
     loaded = import_object(load_spec(name).method)(whole.config)
     loaded.load(tmp_path / "whole", device="cpu")
@@ -150,3 +161,46 @@ def test_antialiased_models_are_as_opaque_in_small_images(name):
         ]
         errors.append(float(np.abs(np.diff(covered)).mean()))
     assert errors[1] < 0.15 * errors[0] and losses[1] != losses[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("chronogs", {"density_interval": 8}),
+        ("scaffold-gs", {"exposure": "image"}),
+        ("3dgs", {"densify_interval": 8}),
+        ("4dgs", {}),
+        ("realtime4dgs", {}),
+        ("gs-w", {}),
+        ("cl-splats", {}),
+    ],
+)
+def test_steps_of_several_views_have_equal_bits_for_any_number_of_threads(name, options, tmp_path):
+    if set_threads() < 2:
+        pytest.skip("one processor only")
+    data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))
+    results = []
+    for threads in (1, 2):
+        set_threads(threads)
+        method = start(name, data, views_per_step=4, **options)
+        reports = train(method)
+        assert sum(report.views for report in reports) == STEPS and reports[-1].views == 2
+        assert reports[-1].loss < reports[0].loss
+        results.append((reports, saved(method, tmp_path / str(threads))))
+    assert results[0] == results[1]
+
+
+def test_a_training_goes_on_with_as_many_views_to_a_step(tmp_path):
+    data = painted_balls.make_training_set(1)
+    first, second = (start("3dgs", data, views_per_step=n) for n in (2, 1))
+    train(first, 0, 4)
+    first.save_training(tmp_path)
+    with pytest.raises(CheckpointError, match=r"views_per_step: expected 2, found 1; go on with"):
+        second.load_training(tmp_path)
+
+
+def test_methods_without_steps_of_several_views_say_so():
+    with pytest.raises(ConfigError, match=r"nerf --set.*views_per_step"):
+        start("nerf", None, views_per_step=2)
+    with pytest.raises(ConfigError, match=r"views_per_step: expected .*found '?0"):
+        start("3dgs", None, views_per_step=0)

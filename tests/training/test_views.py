@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.methods import TrainingView
+from chronoscene.training import views
 from chronoscene.training.views import AHEAD, ViewSampler, downscale_image, downscale_view
 
 
@@ -53,6 +54,32 @@ def test_no_views_is_an_error():
 def view(width: int, height: int) -> TrainingView:
     K = np.array([[50.0, 0.0, 0.5 * width], [0.0, 60.0, 0.4 * height], [0.0, 0.0, 1.0]])
     return TrainingView(K, width, height, np.eye(4), "a.jpg", 0)
+
+
+def test_auto_is_one_view_up_to_two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = {}
+    for threads in (1, 2, 3, 4, 7, 8, 64):
+        monkeypatch.setattr(views, "num_workers", lambda: threads)  # noqa: B023
+        found[threads] = views.count_views("auto")
+        assert views.count_views(5) == 5
+    assert found == {1: 1, 2: 1, 3: 1, 4: 2, 7: 3, 8: 4, 64: 4}
+
+
+@pytest.mark.parametrize(("total", "most"), [(10, 1), (10, 3), (12, 3), (1_000, 4), (999_999, 7)])
+def test_steps_of_several_views_end_where_the_training_does(total: int, most: int) -> None:
+    index, seen = 0, []
+    while index < total:
+        seen.append(views.views_of_step(most, index, index / total))
+        index += seen[-1]
+    assert index == total and set(seen[:-1]) <= {most}
+
+
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_what_is_due_at_an_interval_is_due_once(count: int) -> None:
+    due = [index for index in range(0, 60, count) if views.is_due(index, count, 10)]
+    ends = [10 * (i + 1) for i in range(6)]
+    assert len(due) == 6
+    assert all(index < end <= index + count for index, end in zip(due, ends, strict=True))
 
 
 @pytest.mark.parametrize(("size", "factor"), [((8, 6), 2), ((9, 7), 2), ((10, 10), 4), ((3, 1), 2)])

@@ -18,6 +18,7 @@ from chronoscene.images.disk_cache import DiskCache, files_of
 from chronoscene.images.store import ImageStore, decoded_bytes, evaluation_size
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads, machine_memory
+from chronoscene.methods import Method, MethodConfig, MethodSpec, import_object
 from chronoscene.scene import Scene
 
 _DECODING = 20
@@ -47,6 +48,8 @@ class PhotoNeeds:
     """All photos at the evaluation size."""
     largest: int
     """One photo at the evaluation size."""
+    pixels: int
+    """Number of pixels of that photo."""
     decoding: int
     """A file while it is decoded, at most."""
     decoders: int
@@ -90,6 +93,7 @@ def photo_needs(scene: Scene, settings: RunSettings) -> PhotoNeeds:
         size=size,
         total=total,
         largest=largest,
+        pixels=pixels,
         decoding=decoding,
         decoders=decoders,
         allowed=settings.photo_memory,
@@ -134,6 +138,27 @@ def check_room(needs: PhotoNeeds, folder: Path, runs: int, *, here: bool = True)
     return (
         f"{needs.scene}: {photos}: {_gb(needs.in_memory)} in memory{kept}; a training takes "
         f"{_gb(needs.training)} and its model besides"
+    )
+
+
+def device_need(scene: Scene, needs: PhotoNeeds, spec: MethodSpec, config: MethodConfig) -> str:
+    """Describe what a training takes of the memory of a GPU; empty if the method does not say.
+
+    Args:
+        scene: What it is trained on.
+        needs: Of its photos.
+        spec: The method.
+        config: Its options.
+    """
+    if not spec.method or not hasattr(import_object(spec.method), "device_memory"):
+        return ""
+    method: Method = import_object(spec.method)(config)
+    periods = len(scene.periods) if spec.period_input != "none" else 1
+    count, parts = method.device_memory(len(scene.points.xyz), periods, needs.pixels)
+    listed = ", ".join(f"{name} {_gb(size)}" for name, size in parts.items())
+    return (
+        f"{needs.scene}: {spec.name} takes about {_gb(sum(parts.values()))} of the GPU with "
+        f"{count:,} primitives in view: {listed}; an estimate, without what CUDA takes"
     )
 
 

@@ -13,7 +13,7 @@ from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.checks import check_run
 from chronoscene.harness.plan.finished import continued, is_to_do
 from chronoscene.harness.plan.job import Job
-from chronoscene.harness.plan.memory import check_room
+from chronoscene.harness.plan.memory import check_room, device_need
 from chronoscene.harness.plan.parts import effective_strategy
 from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun, resolve_methods
 from chronoscene.harness.plan.scenes import BenchScene, read_scenes
@@ -46,6 +46,11 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
         missing = {k: run for k, run in here.items() if is_to_do(run, settings.overwrite)}
         if trained := sum(run.spec.runner is None for run in missing.values()):
             log(check_room(scene.needs, shared.runs, trained, here=settings.ray is None))
+        if shared.device == "cuda":
+            configs = {run.spec.name: (run.spec, run.config) for run in missing.values()}
+            for needed in configs.values():
+                if line := device_need(scene.content, scene.needs, *needed):
+                    log(line)
         freeze_ground_truth(shared.runs, scene.content, scene.hash, shared.max_width)
         runs |= here
         todo |= missing

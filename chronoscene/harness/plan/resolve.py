@@ -25,6 +25,8 @@ from chronoscene.methods import (
     load_spec,
 )
 
+_NEUTRAL = {"views_per_step": 1}
+
 
 @dataclass(frozen=True, slots=True)
 class ResolvedMethod:
@@ -104,7 +106,7 @@ class ResolvedRun:
         decides = {
             "method": job.method_name,
             "preset": settings.preset_name,
-            "method_config": deciding_options(config),
+            "method_config": _known_before(deciding_options(config)),
             "strategy": job.strategy,
             "stop": dataclasses.asdict(stop),
             "separate_iterations": settings.separate_iterations,
@@ -202,6 +204,14 @@ def _config(spec: MethodSpec, settings: RunSettings) -> MethodConfig:
             todo="correct --iterations",
         )
     return config
+
+
+def _known_before(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out options that came later, with the values that change nothing.
+
+    Runs of versions that did not have them are the same runs.
+    """
+    return {name: value for name, value in options.items() if _NEUTRAL.get(name) != value}
 
 
 def deciding_options(config: MethodConfig) -> dict[str, Any]:

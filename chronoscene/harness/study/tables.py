@@ -153,7 +153,12 @@ def _signed(entry: Mapping[Any, Any]) -> str:
 
 
 def directions(study: Study, entries: DataFrame) -> list[str]:
-    """Return a sentence for each scene and row but the first, by `direction`."""
+    """Return a sentence for each scene and row but the first, by `direction`.
+
+    There is none if nothing is published of any row.
+    """
+    if not _is_published(study):
+        return []
     is_measured = entries.source == MEASURED
     metrics = [name for name in _quantities(study, entries) if name in all_metrics()]
     sentences = []
@@ -172,6 +177,10 @@ def directions(study: Study, entries: DataFrame) -> list[str]:
             text = "; ".join(said) or "nothing is published to compare with"
             sentences.append(f"{scene}, {row.label}: {text}.")
     return sentences
+
+
+def _is_published(study: Study) -> bool:
+    return any(row.published for row in study.rows)
 
 
 def direction(entry: Mapping[Any, Any], published: Sequence[float]) -> str:
@@ -216,9 +225,9 @@ def study_texts(
     runs = {label: [r for r in records if r.folder in paths] for label, paths in finished.items()}
     entries = study_entries(study, runs)
     table, sentences = study_table(study, entries), directions(study, entries)
+    printed = "; for published figures in parentheses" if _is_published(study) else ""
     notes = [
-        f"difference: to {study.rows[0].label!r}, with its 95 % interval; for published figures in "
-        "parentheses",
+        f"difference: to {study.rows[0].label!r}, with its 95 % interval{printed}",
         *([f"published: {study.source}"] if study.source else []),
         *study.notes,
     ]

@@ -37,7 +37,7 @@ class LoopState(BaseModel):
 
     format_version: Literal[1] = 1
     iterations: int = 0
-    """Steps done."""
+    """Steps done; one of several views counts as so many, here and below."""
     seconds: float = 0.0
     """Time on the training clock."""
     setup_seconds: float = 0.0

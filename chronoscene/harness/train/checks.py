@@ -30,6 +30,9 @@ def check_step(report: StepReport, place: str) -> None:
     _check_type(report, StepReport, place)
     _check_number(report.loss, Real, f"{place}: StepReport.loss", "a number")
     _check_number(report.primitives, Integral, f"{place}: StepReport.primitives", "an integer")
+    _check_number(report.views, Integral, f"{place}: StepReport.views", "an integer")
+    if report.views < 1:
+        raise refuse(f"{place}: StepReport.views", "at least 1", report.views)
     if report.skipped not in (None, "empty", "not finite"):
         raise refuse(
             f"{place}: StepReport.skipped", "None, 'empty' or 'not finite'", repr(report.skipped)

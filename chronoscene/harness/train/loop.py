@@ -27,7 +27,8 @@ PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 
 
 NOT_FINITE_LIMIT = 50
-"""Steps in a row without a finite loss and finite gradients that end a training."""
+"""Steps in a row without a finite loss and finite gradients that end a training; one of several
+views counts as so many."""
 
 _REMEDY = (
     "lower the learning rates, or take preset paper-scaled instead of paper, if the method has "
@@ -180,14 +181,14 @@ def train(
         check_step(report, f"model {part.name}, iteration {state.iterations + 1}")
         spent = clock.seconds - waiting.seconds - state.seconds
         waiting.seconds += pauses.pause(spent, working.seconds)
-        state.iterations += 1
+        state.iterations += report.views
         state.seconds = clock.seconds - waiting.seconds
         state.waited_seconds = waiting.seconds
         done = stop.progress(state.iterations, state.seconds)
         if _was_finite(report, state):
             last_good = state.iterations
-        elif state.iterations - last_good == NOT_FINITE_LIMIT:
-            raise _diverged(report, part, last_good)
+        elif state.iterations - last_good >= NOT_FINITE_LIMIT:
+            raise _diverged(report, part, last_good, state.iterations)
         if report.skipped == "empty":
             unseen.append(report.loss)
         else:
@@ -214,22 +215,22 @@ def train(
 def _was_finite(report: StepReport, state: LoopState) -> bool:
     """Count skipped steps; return True if the step was finite."""
     if report.skipped == "not finite" or not math.isfinite(report.loss):
-        state.skipped_steps += 1
+        state.skipped_steps += report.views
         return False
     if state.first_loss is None:
         state.first_loss = report.loss
-    state.empty_steps += report.skipped == "empty"
+    state.empty_steps += report.views * (report.skipped == "empty")
     return True
 
 
-def _diverged(report: StepReport, part: Part, last_good: int) -> TrainingError:
+def _diverged(report: StepReport, part: Part, last_good: int, reached: int) -> TrainingError:
     todo, names = _REMEDY, ", ".join(report.not_finite)
     if report.skipped:
         todo = f"the model of iteration {last_good} is kept in checkpoint; {todo}"
     return (DivergedError if report.skipped else TrainingError)(
-        f"model {part.name}, iteration {last_good + NOT_FINITE_LIMIT}",
+        f"model {part.name}, iteration {reached}",
         expected="a finite loss and finite gradients",
-        found=f"{NOT_FINITE_LIMIT} steps in a row without"
+        found=f"{reached - last_good} steps in a row without"
         + (f", the last one in {names}" if names else ""),
         todo=todo,
     )

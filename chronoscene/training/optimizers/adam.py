@@ -23,10 +23,6 @@ from chronoscene.training import devices
 BETA1 = 0.9
 BETA2 = 0.999
 EPS = 1e-15  # Added to the root of the second moment, as in 3DGS
-# Rounded once: 1 - float32(0.999) would be off by 5e-5.
-GAIN1 = float32(1 - BETA1)
-KEEP2 = float32(BETA2)
-GAIN2 = float32(1 - BETA2)
 
 BLOCK = 16384
 """Elements per task. Fixed, so that vector bodies and remainders fall on the same elements, and
@@ -36,6 +32,46 @@ results are equal bit by bit, for any number of threads."""
 # 1e-18 of a learning rate. Left to decay they end up as denormals, which are slow on many CPUs.
 TINY_MEAN = float32(1e-34)
 TINY_SQUARE = float32(1e-37)
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Scale of learning rates and moments in a step from the sum of several gradients.
+
+    A step of n views shall move the model about as far as n steps of one view do. If gradients of
+    different views are independent, that takes the rate times sqrt(n), as Adam divides by the root
+    of a sum of n squares, and moments that fade as in n steps. The number 1 changes nothing.
+
+    Source: Zhao et al. 2024 (Grendel), "On Scaling Up 3D Gaussian Splatting Training".
+    """
+
+    views: int = 1
+    """n: number of views of a step."""
+
+    @property
+    def rate(self) -> float:
+        """Factor of all learning rates."""
+        return self.views**0.5
+
+    @property
+    def beta1(self) -> float:
+        """Share of the first moment that a step leaves."""
+        return BETA1**self.views
+
+    @property
+    def beta2(self) -> float:
+        """Share of the second moment that a step leaves."""
+        return BETA2**self.views
+
+    def scalars(self, rate: float, root: float) -> tuple[float, ...]:
+        """Return `SCALARS` numbers for a step; arguments as in `adam_block`."""
+        # Rounded once: 1 - float32(0.999) would be off by 5e-5.
+        return rate, root, EPS, 1 - self.beta1, self.beta2, 1 - self.beta2
+
+
+ONE_VIEW = Pace()
+SCALARS = 6
+"""Numbers of a step: rate, root, eps, and by what moments change; see `adam_block`."""
 
 
 @dataclass(slots=True, eq=False)
@@ -56,6 +92,7 @@ class Update(NamedTuple):
     moments: _Moments
     rate: float
     root: float
+    pace: Pace = ONE_VIEW
 
 
 class Adam:
@@ -67,9 +104,11 @@ class Adam:
 
     Args:
         params: Contiguous leaf tensors that require a gradient.
+        pace: By how many views the gradients of a step are.
     """
 
-    def __init__(self, params: Mapping[str, Tensor]) -> None:
+    def __init__(self, params: Mapping[str, Tensor], pace: Pace = ONE_VIEW) -> None:
+        self._pace = pace
         self.params: dict[str, Tensor] = {}
         self._moments: dict[str, _Moments] = {}
         for name, value in params.items():
@@ -110,9 +149,10 @@ class Adam:
                 continue
             moments = self._moments[name]
             moments.steps += 1
-            rate = lrs[name] / (1 - BETA1**moments.steps)
-            root = (1 - BETA2**moments.steps) ** -0.5
-            found.append(Update(value, value.grad, moments, rate, root))
+            pace = self._pace
+            rate = pace.rate * lrs[name] / (1 - pace.beta1**moments.steps)
+            root = (1 - pace.beta2**moments.steps) ** -0.5
+            found.append(Update(value, value.grad, moments, rate, root, pace))
         return found
 
     def extend(self, name: str, new_rows: Tensor) -> Tensor:
@@ -177,10 +217,10 @@ def apply_updates(updates: Iterable[Update]) -> None:
     addresses = np.array(
         [
             (value.data_ptr(), grad.data_ptr(), m.mean.data_ptr(), m.square.data_ptr())
-            for value, grad, m, _, _ in compiled
+            for value, grad, m, *_ in compiled
         ]
     )
-    scalars = np.array([(u.rate, u.root, EPS) for u in compiled], dtype=np.float32)
+    scalars = np.array([u.pace.scalars(u.rate, u.root) for u in compiled], dtype=np.float32)
     sizes = np.array([u.value.numel() for u in compiled])
     # Starting the threads costs more than a small update.
     run = adam_tensors if sizes.max() > BLOCK else adam_tensors_alone
@@ -194,28 +234,33 @@ def _block_starts(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     return starts
 
 
-def _step_torch(value: Tensor, grad: Tensor, moments: _Moments, rate: float, root: float) -> None:
-    moments.mean.lerp_(grad, 1 - BETA1)
-    moments.square.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
+def _step_torch(
+    value: Tensor, grad: Tensor, moments: _Moments, rate: float, root: float, pace: Pace
+) -> None:
+    moments.mean.lerp_(grad, 1 - pace.beta1)
+    moments.square.mul_(pace.beta2).addcmul_(grad, grad, value=1 - pace.beta2)
     value.addcdiv_(moments.mean, (moments.square.sqrt() * root).add_(EPS), value=-rate)
 
 
 @kernel(fastmath={"contract", "nsz", "arcp"})
-def adam_block(values, grads, means, squares, rate, root, eps):  # type: ignore[no-untyped-def]
+def adam_block(values, grads, means, squares, scalars):  # type: ignore[no-untyped-def]
     """Update a flat array in place (Kingma and Ba 2015, algorithm 1).
 
-    mean += (1 - BETA1) (grad - mean);  square = BETA2 square + (1 - BETA2) grad²;
+    mean += gain1 (grad - mean);  square = keep2 square + gain2 grad²;
     value -= rate * mean / (sqrt(square) * root + eps).
 
     Args:
-        rate: Learning rate over the bias correction of the first moment.
-        root: 1 over the root of the bias correction of the second moment.
+        scalars: rate, the learning rate over the bias correction of the first moment; root, 1 over
+            the root of the bias correction of the second moment; eps; gain1 = 1 - beta1,
+            keep2 = beta2 and gain2 = 1 - beta2. [SCALARS]
     """
     zero = float32(0)
+    rate, root, eps = scalars[0], scalars[1], scalars[2]
+    gain1, keep2, gain2 = scalars[3], scalars[4], scalars[5]
     for i in range(values.shape[0]):
         grad = grads[i]
-        mean = means[i] + GAIN1 * (grad - means[i])
-        square = KEEP2 * squares[i] + GAIN2 * grad * grad
+        mean = means[i] + gain1 * (grad - means[i])
+        square = keep2 * squares[i] + gain2 * grad * grad
         mean = zero if abs(mean) < TINY_MEAN else mean
         square = zero if square < TINY_SQUARE else square
         values[i] -= rate * mean / (math.sqrt(square) * root + eps)
@@ -233,7 +278,7 @@ def _adam_of_block(addresses, starts, sizes, scalars, block):  # type: ignore[no
         floats_at(addresses[n, 2] + move, count),
         floats_at(addresses[n, 3] + move, count),
     )
-    adam_block(value, grad, mean, square, scalars[n, 0], scalars[n, 1], scalars[n, 2])
+    adam_block(value, grad, mean, square, scalars[n])
 
 
 @kernel(parallel=True)
@@ -244,7 +289,7 @@ def adam_tensors(addresses, starts, sizes, scalars):  # type: ignore[no-untyped-
         addresses: Of values, gradients, means and squares of each array. int64 [n, 4]
         starts: Number of the first block of each array, and of all blocks at the end. [n + 1]
         sizes: Elements of each. int64 [n]
-        scalars: rate, root and eps of each, as in `adam_block`. float32 [n, 3]
+        scalars: Of each, as in `adam_block`. float32 [n, SCALARS]
     """
     for block in prange(starts[-1]):
         _adam_of_block(addresses, starts, sizes, scalars, block)
@@ -304,11 +349,14 @@ class DenseTable:
 
     Args:
         value: The table. [R, ...]
+        pace: As of `Adam`.
     """
 
-    def __init__(self, value: Tensor) -> None:
-        self._adam = Adam({"table": value.detach().requires_grad_()})
-        self._fetched: tuple[Tensor, Tensor] | None = None
+    def __init__(self, value: Tensor, pace: Pace = ONE_VIEW) -> None:
+        self._pace = pace
+        self._adam = Adam({"table": value.detach().requires_grad_()}, pace)
+        self.fetched: tuple[Tensor, Tensor] | None = None
+        """Rows, and their copies of which `step` uses the gradient; may be set."""
 
     @property
     def value(self) -> Tensor:
@@ -317,19 +365,19 @@ class DenseTable:
 
     def gradient(self) -> Tensor | None:
         """Return the gradient that `step` will use, if there is one."""
-        return None if self._fetched is None else self._fetched[1].grad
+        return None if self.fetched is None else self.fetched[1].grad
 
     def fetch(self, rows: Tensor) -> Tensor:
         """Copy some rows, up to date, as a leaf that collects a gradient. [M, ...]
 
-        `step` uses that gradient; the copies of an earlier call are forgotten. The table is left as
-        it is.
+        `step` uses the gradient of the last copies. The table is left as it is. Several threads may
+        fetch at a time.
 
         Args:
             rows: Each at most once. int64 [M]
         """
         leaf = self.value.index_select(0, rows).requires_grad_()
-        self._fetched = rows, leaf
+        self.fetched = rows, leaf
         return leaf
 
     def step(self, rate: float) -> None:
@@ -339,9 +387,9 @@ class DenseTable:
     def updates(self, rate: float) -> list[Update]:
         """Count a step and return what `apply_updates` has to do for it."""
         grad = torch.zeros_like(self.value)
-        if self._fetched is not None and (found := self._fetched[1].grad) is not None:
-            grad[self._fetched[0]] = found
-        self._fetched = None
+        if self.fetched is not None and (found := self.fetched[1].grad) is not None:
+            grad[self.fetched[0]] = found
+        self.fetched = None
         self._adam.params["table"].grad = grad
         updates = self._adam.updates({"table": rate})
         self._adam.zero_grad()
@@ -364,17 +412,18 @@ class DenseTable:
 
     def load_state(self, state: Mapping[str, Tensor]) -> Tensor:
         """Restore what `state` gave, with any number of rows; return the table."""
-        self._fetched = None
-        self._adam = Adam({"table": state["value"].to(self.value, copy=True).requires_grad_()})
+        self.fetched = None
+        value = state["value"].to(self.value, copy=True).requires_grad_()
+        self._adam = Adam({"table": value}, self._pace)
         self._adam.load_state(state)
         return self.value
 
     def extend(self, new_rows: Tensor) -> Tensor:
         """Append rows with zero moments; return the table. [n, ...]"""
-        self._fetched = None
+        self.fetched = None
         return self._adam.extend("table", new_rows).detach()
 
     def keep(self, mask: Tensor) -> Tensor:
         """Keep the rows of a mask; return the table. bool [R]"""
-        self._fetched = None
+        self.fetched = None
         return self._adam.keep("table", mask).detach()

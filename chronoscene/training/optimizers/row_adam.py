@@ -31,23 +31,19 @@ from chronoscene.kernels.memory import (
 from chronoscene.kernels.vectors import LANES, select, splat, sqrt
 from chronoscene.training import devices
 from chronoscene.training.optimizers.adam import (
-    BETA1,
     BETA2,
     EPS,
-    GAIN1,
-    GAIN2,
-    KEEP2,
+    ONE_VIEW,
     TINY_MEAN,
     TINY_SQUARE,
     DenseTable,
+    Pace,
 )
 
 _HORIZON = 256
 """Steps after which a number that is not read no longer moves: what is left of its way is 2e-12 of
 it."""
-_RATIO = BETA1 / BETA2**0.5
-_POWERS = _RATIO ** np.arange(_HORIZON + 1)
-_SHARES = np.stack([beta ** np.arange(_HORIZON + 1) for beta in (BETA1, BETA2)], axis=1)
+_WAITS = np.arange(_HORIZON + 1)
 LOG_BETA2 = math.log(BETA2)
 WAY_PARTS = 3
 """Numbers for each gap: way over mean / root of square, and what is left of the two moments."""
@@ -57,9 +53,9 @@ CHUNK = 256  # Rows that a task takes at a time
 ZERO = float32(0)
 
 
-def make_table(value: Tensor) -> RowAdam | DenseTable:
+def make_table(value: Tensor, pace: Pace = ONE_VIEW) -> RowAdam | DenseTable:
     """Make a `RowAdam` where its kernels run, else a `DenseTable`."""
-    return RowAdam(value) if devices.has_kernels(value) else DenseTable(value)
+    return (RowAdam if devices.has_kernels(value) else DenseTable)(value, pace)
 
 
 class RowAdam:
@@ -77,11 +73,15 @@ class RowAdam:
 
     Args:
         value: The table. [R, ...]
+        pace: As of `Adam`; has the betas.
     """
 
-    def __init__(self, value: Tensor) -> None:
+    def __init__(self, value: Tensor, pace: Pace = ONE_VIEW) -> None:
         self.value = value.detach().contiguous()
         self.steps = 0
+        self._pace = pace
+        self._powers = (pace.beta1 / pace.beta2**0.5) ** _WAITS
+        self._shares = np.stack([beta**_WAITS for beta in (pace.beta1, pace.beta2)], axis=1)
         self._columns = int(np.prod(value.shape[1:]))
         self._mean, self._square = (torch.zeros_like(self.value) for _ in range(2))
         self._stamps = np.zeros(len(value), np.int64)
@@ -91,25 +91,22 @@ class RowAdam:
         self._settled = np.empty(_HORIZON, np.float32)
         """The whole way of what was last read at each step, known up to `_HORIZON` steps ago; the
         rest is spare room."""
-        self._fetched: tuple[Tensor, Tensor] | None = None
-        """Rows of the last copies, and these."""
+        self.fetched: tuple[Tensor, Tensor] | None = None
 
     def fetch(self, rows: Tensor) -> Tensor:
         return fetch_together([(self, rows)])[0]
-
-    def gradient(self) -> Tensor | None:
-        return None if self._fetched is None else self._fetched[1].grad
 
     def step(self, rate: float) -> None:
         step_together([(self, rate)])
 
     def _corrections(self, rate: float) -> tuple[float, float]:
         """Return the rate and the root of the next step, as in `adam_block`."""
-        root = (1 - BETA2 ** (self.steps + 1)) ** -0.5
-        return rate / (1 - BETA1 ** (self.steps + 1)), root
+        pace, steps = self._pace, self.steps + 1
+        root = (1 - pace.beta2**steps) ** -0.5
+        return pace.rate * rate / (1 - pace.beta1**steps), root
 
     def _count_step(self, corrected: float, root: float) -> None:
-        self._fetched = None
+        self.fetched = None
         self.steps += 1
         self._speeds.append(corrected / root)
         self._ways = self._new_ways()
@@ -124,7 +121,7 @@ class RowAdam:
     def flush(self) -> Tensor:
         self.value.copy_(self.snapshot())
         gaps = self.steps - self._stamps
-        for moments, beta in ((self._mean, BETA1), (self._square, BETA2)):
+        for moments, beta in ((self._mean, self._pace.beta1), (self._square, self._pace.beta2)):
             left = torch.from_numpy((beta**gaps).astype(np.float32))
             moments.view(len(left), self._columns).mul_(left[:, None])
         self._stamps[:] = self.steps
@@ -133,9 +130,9 @@ class RowAdam:
     def snapshot(self) -> Tensor:
         if not (self._stamps < self.steps).any():
             return self.value
-        fetched = self._fetched
+        fetched = self.fetched
         copies = self.fetch(torch.arange(len(self.value))).detach()
-        self._fetched = fetched
+        self.fetched = fetched
         return copies
 
     def state(self) -> dict[str, Tensor]:
@@ -160,7 +157,7 @@ class RowAdam:
         settled = state["settled"].numpy()
         room = np.empty(_HORIZON, np.float32)
         self._settled = np.concatenate([settled, room])
-        self._fetched = None
+        self.fetched = None
         return self.value
 
     def extend(self, new_rows: Tensor) -> Tensor:
@@ -180,7 +177,7 @@ class RowAdam:
 
     def _mark_all(self) -> None:
         self._stamps = np.full(len(self.value), self.steps, np.int64)
-        self._fetched = None
+        self.fetched = None
 
     def _job(self, rows: Tensor, copies: Tensor, grads: int = 0) -> tuple[int, ...]:
         """Return the numbers of `_Table`, `_Rows` and `_Waits`, as the kernels take them."""
@@ -199,6 +196,7 @@ class RowAdam:
             ways.ctypes.data,
             len(ways) - 1,
             settled.ctypes.data,
+            self._pace.views,
         )
 
     def _new_ways(self) -> NDArray[np.float32]:
@@ -209,9 +207,10 @@ class RowAdam:
         speeds = np.array(self._speeds[-_HORIZON:])
         count = len(speeds)
         # Summed from the last and smallest term on, each in units of the first step after s.
-        sums = np.cumsum((speeds * _POWERS[1 : count + 1])[::-1]) / _POWERS[:count][::-1]
+        powers = self._powers
+        sums = np.cumsum((speeds * powers[1 : count + 1])[::-1]) / powers[:count][::-1]
         ways = np.empty((count + 1, WAY_PARTS), np.float32)
-        ways[0, 0], ways[1:, 0], ways[:, 1:] = 0.0, sums, _SHARES[: count + 1]
+        ways[0, 0], ways[1:, 0], ways[:, 1:] = 0.0, sums, self._shares[: count + 1]
         return ways
 
 
@@ -250,6 +249,8 @@ class _Waits(NamedTuple):
     """G; what waited longer has gone all its way."""
     settled: int
     """Address of the way of those, by their stamp. float32"""
+    views: int
+    """`Pace.views`."""
 
 
 @inner
@@ -268,7 +269,7 @@ def _wait_of(table, row, waits):  # type: ignore[no-untyped-def]
     if gap <= waits.longest:
         at = WAY_PARTS * gap
         return read(waits.ways, at), read(waits.ways, at + 1), read(waits.ways, at + 2)
-    return read(waits.settled, stamp), ZERO, float32(math.exp(gap * LOG_BETA2))
+    return read(waits.settled, stamp), ZERO, float32(math.exp(gap * waits.views * LOG_BETA2))
 
 
 @inner
@@ -306,7 +307,7 @@ def _part_of(jobs, starts, task):  # type: ignore[no-untyped-def]
     j = jobs[n]
     rows = _Rows(j[5], j[6], j[7], j[8])
     first = (task - starts[n]) * CHUNK
-    job = (_Table(j[0], j[1], j[2], j[3], j[4]), rows, _Waits(j[9], j[10], j[11], j[12]))
+    job = (_Table(j[0], j[1], j[2], j[3], j[4]), rows, _Waits(j[9], j[10], j[11], j[12], j[13]))
     return n, job, first, min(first + CHUNK, rows.length)
 
 
@@ -324,15 +325,15 @@ def _fetch(jobs, starts, eps):  # type: ignore[no-untyped-def]
 
 @inner
 def _step(table, rows, m, row, shares, scalars):  # type: ignore[no-untyped-def]
-    (keep1, keep2), (rate, root, eps) = shares, scalars
+    (kept1, kept2), (rate, root, eps, gain1, keep2, gain2) = shares, scalars
     at, to = row * table.columns, m * table.columns
     for c in range(0, table.columns, LANES):
         left = table.columns - c
         grad = load_first(rows.grads, to + c, left)
-        mean = keep1 * load_first(table.means, at + c, left)
-        mean = mean + GAIN1 * (grad - mean)
-        square = (KEEP2 * keep2) * load_first(table.squares, at + c, left)
-        mean, square = _clean(mean, square + GAIN2 * grad * grad)
+        mean = kept1 * load_first(table.means, at + c, left)
+        mean = mean + gain1 * (grad - mean)
+        square = (keep2 * kept2) * load_first(table.squares, at + c, left)
+        mean, square = _clean(mean, square + gain2 * grad * grad)
         moved = rate * mean / (sqrt(square) * root + eps)
         store_first(table.values, at + c, load_first(rows.copies, to + c, left) - moved, left)
         store_first(table.means, at + c, mean, left)
@@ -345,31 +346,33 @@ def _update(jobs, starts, scalars):  # type: ignore[no-untyped-def]
 
     Args:
         jobs: See `_part_of`, like ``starts``.
-        scalars: rate, root and eps of each table, as in `adam_block`. float32 [n, 3]
+        scalars: Of each table, as in `adam_block`. float32 [n, SCALARS]
     """
     for task in prange(starts[-1]):
         n, (table, rows, waits), first, stop = _part_of(jobs, starts, task)
-        given = scalars[n, 0], scalars[n, 1], scalars[n, 2]
+        s = scalars[n]
+        given = s[0], s[1], s[2], s[3], s[4], s[5]
         for m in range(first, stop):
             row = read_index(rows.numbers, m)
             _prefetch(table, rows, m + AHEAD)
-            _, keep1, keep2 = _wait_of(table, row, waits)
-            _step(table, rows, m, row, (keep1, keep2), given)
+            _, kept1, kept2 = _wait_of(table, row, waits)
+            _step(table, rows, m, row, (kept1, kept2), given)
             write_index(table.stamps, row, waits.now + 1)
 
 
 def fetch_together(wanted: Sequence[tuple[RowAdam, Tensor]]) -> list[Tensor]:
     """Do `RowAdam.fetch` for several tables, in one compiled call."""
-    eps, jobs = [], []
+    eps, jobs, found = [], [], []
     for table, rows in wanted:
         rows = rows.contiguous()
         copies = torch.empty(len(rows), *table.value.shape[1:])
         # In units of the root of the second moment without bias correction.
-        eps.append(EPS * (1 - BETA2 ** max(table.steps, 1)) ** 0.5)
+        eps.append(EPS * (1 - table._pace.beta2 ** max(table.steps, 1)) ** 0.5)
         jobs.append(table._job(rows, copies))
-        table._fetched = rows, copies.requires_grad_()
+        found.append(copies.requires_grad_())
+        table.fetched = rows, copies
     _fetch(*_packed(jobs), np.array(eps, np.float32))
-    return [table._fetched[1] for table, _ in wanted if table._fetched]
+    return found
 
 
 def step_together(rates: Sequence[tuple[RowAdam, float]]) -> None:
@@ -377,10 +380,10 @@ def step_together(rates: Sequence[tuple[RowAdam, float]]) -> None:
     scalars, jobs, alive = [], [], []
     corrections = [table._corrections(rate) for table, rate in rates]
     for (table, _), (corrected, root) in zip(rates, corrections, strict=True):
-        if table._fetched is not None and (found := table._fetched[1].grad) is not None:
+        if table.fetched is not None and (found := table.fetched[1].grad) is not None:
             alive.append(found.contiguous())
-            jobs.append(table._job(*table._fetched, alive[-1].data_ptr()))
-            scalars.append((corrected, root, EPS))
+            jobs.append(table._job(*table.fetched, alive[-1].data_ptr()))
+            scalars.append(table._pace.scalars(corrected, root))
     if jobs:
         _update(*_packed(jobs), np.array(scalars, np.float32))
     for (table, _), correction in zip(rates, corrections, strict=True):

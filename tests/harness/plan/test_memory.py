@@ -9,7 +9,7 @@ from PIL import Image
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.plan import memory as planning
-from chronoscene.harness.plan.memory import check_room, open_store, photo_needs
+from chronoscene.harness.plan.memory import check_room, device_need, open_store, photo_needs
 from chronoscene.harness.plan.parts import make_parts
 from chronoscene.harness.plan.stop import StopRule
 from chronoscene.harness.train.checkpoints import Checkpoints
@@ -84,6 +84,20 @@ def test_the_line_says_what_is_taken(make_scene, settings, free):
     assert line.endswith("training takes 0.50 GB and its model besides")
     settings.photo_memory = LITTLE
     assert "GB in memory, 0.00 GB on disk; a" in room(make_scene(), settings, runs=1)
+
+
+def test_the_memory_of_a_gpu_is_estimated_by_parts(make_scene, settings):
+    scene = make_scene()
+    needs = photo_needs(scene, settings)
+    spec = load_spec("3dgs")
+    config = build_config(spec, preset="fast", overrides={"max_gaussians": 1_000_000})
+    assert device_need(scene, needs, spec, config) == (
+        "ring: 3dgs takes about 1.24 GB of the GPU with 1,000,000 primitives in view: model "
+        "0.24 GB, gradients and moments 0.71 GB, drawn Gaussians 0.11 GB, rasterizer 0.18 GB, "
+        "images 0.00 GB; an estimate, without what CUDA takes"
+    )
+    nerf = load_spec("nerf")
+    assert device_need(scene, needs, nerf, build_config(nerf, preset="fast")) == ""
 
 
 def test_memory_counts_where_the_run_will_be(make_scene, settings, free):

@@ -9,6 +9,7 @@ from chronoscene import methods
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
+from chronoscene.harness.plan import plan as planning
 from chronoscene.harness.plan import resolve
 from chronoscene.harness.plan.finished import first_difference
 from chronoscene.harness.plan.plan import plan_runs
@@ -43,6 +44,33 @@ def test_planning_builds_each_configuration_once(scene_folder, tmp_path, monkeyp
     settings = bench_settings((scene_folder,), names, tmp_path / "runs", seeds=(0, 1))
     assert len(plan_runs(settings, lambda line: None).runs) == 4
     assert sorted(built) == ["blind", "blind", "mean", "mean"]
+
+
+def test_a_bench_on_a_gpu_begins_with_what_each_method_takes_of_its_memory(
+    scene_folder, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(planning, "check_device", lambda device: None)
+    for device, expected in (("cuda", ["chronogs", "3dgs"]), ("cpu", []), ("auto", [])):
+        settings = bench_settings(
+            (scene_folder,), ("chronogs", "3dgs"), tmp_path / device, seeds=(0, 1), device=device
+        )
+        said = []
+        plan_runs(settings, said.append)
+        assert [line.split()[1] for line in said if " of the GPU with " in line] == expected
+
+
+def test_one_view_to_a_step_is_what_earlier_versions_did(scene_folder, tmp_path):
+    """Their runs, whose settings do not name the option, are neither trained again nor others."""
+    documents = []
+    for number in (1, 2):
+        settings = bench_settings(
+            (scene_folder,), ("3dgs",), tmp_path, overrides={"views_per_step": str(number)}
+        )
+        (run,) = plan_runs(settings, lambda line: None).runs.values()
+        documents.append((run.document["config"]["method_config"], run.job.variant))
+    (first, plain), (second, variant) = documents
+    assert "views_per_step" not in first and plain == ""
+    assert second == {**first, "views_per_step": 2} and variant == "views_per_step=2"
 
 
 def test_a_scene_without_points_is_refused_before_anything_starts(scene_folder, tmp_path):

@@ -33,6 +33,8 @@ def test_what_is_right_passes():
         (check_step, StepReport("a", 1), "at: StepReport.loss: expected a number, found 'a';"),
         (check_step, StepReport(1.0, 1.5), "at: StepReport.primitives: expected an integer, found"),
         (check_step, StepReport(1.0, 1, "no"), "at: StepReport.skipped: expected None, 'empty' or"),
+        (check_step, StepReport(1.0, 1, views=1.5), "at: StepReport.views: expected an integer, f"),
+        (check_step, StepReport(1.0, 1, views=0), "at: StepReport.views: expected at least 1, f"),
         (check_size, (1, 2), "at: expected a MethodSize, found tuple;"),
         (check_size, MethodSize(None, 2), "at: MethodSize.primitives: expected an integer, f"),
         (check_size, MethodSize(1, 2.5), "at: MethodSize.parameters: expected an integer, f"),

@@ -2,6 +2,7 @@
 
 import math
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -196,6 +197,32 @@ def test_steps_that_taught_nothing_are_counted(part):
     assert (trained.iterations, trained.empty_steps, trained.skipped_steps) == (20, 0, 3)
     trained = run(reporting(range(1, 20), 0.1, "empty"), part, StopRule(20, None))
     assert (trained.iterations, trained.empty_steps, trained.skipped_steps) == (20, 19, 0)
+
+
+def of_three_views(skipped_from, skipped):
+    """A method of three views to a step, which teach nothing from an iteration on."""
+    method = toy()
+    step = method.step
+
+    def reported(index, progress):
+        if index >= skipped_from:
+            return StepReport(math.nan if skipped == "not finite" else 0.1, 1, skipped, views=3)
+        return replace(step(index, progress), views=3)
+
+    method.step = reported
+    return method
+
+
+def test_iterations_count_views(part):
+    seen = []
+    method = of_three_views(24, "empty")
+    trained = run(method, part, StopRule(30, None), observer=lambda i, *rest: seen.append(i))
+    assert seen == list(range(3, 31, 3))
+    assert (trained.iterations, trained.empty_steps, trained.skipped_steps) == (30, 6, 0)
+    with pytest.raises(DivergedError, match=r"iteration 57: .* found 51 steps in a row"):
+        run(of_three_views(6, "not finite"), part, StopRule(400, None))
+    with pytest.raises(TrainingError, match="found none in 60 steps; check that the sparse"):
+        run(of_three_views(0, "empty"), part, StopRule(60, None))
 
 
 def test_only_a_run_of_steps_that_are_not_finite_ends_the_training(part):

@@ -13,8 +13,8 @@ from chronoscene.training.schedules import log_linear
 def test_moments_are_the_steps_of_each_model_or_stage(bench_here, monkeypatch, method, strategy):
     due, at = [], Timeline.at
 
-    def watched(timeline, index, progress):
-        due.append((index, at(timeline, index, progress)))
+    def watched(timeline, index, progress, views):
+        due.append((index, at(timeline, index, progress, views)))
         return due[-1][1]
 
     monkeypatch.setattr(Timeline, "at", watched)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chronoscene.training.optimizers import row_adam
-from chronoscene.training.optimizers.adam import Adam
+from chronoscene.training.optimizers.adam import ONE_VIEW, Adam, Pace
 from chronoscene.training.optimizers.row_adam import RowAdam, fetch_together, step_together
 
 # Worst of 400 runs: 3e-6 of the rates' sum, by which everything may move.
@@ -20,12 +20,13 @@ TOLERANCE = 1e-5
 class Both:
     """The same table under both optimisers, the gradient of what is not read being zero."""
 
-    def __init__(self, rows: int, columns: int, seed: int) -> None:
+    def __init__(self, rows: int, columns: int, seed: int, pace: Pace = ONE_VIEW) -> None:
         self.rng = np.random.default_rng(seed)
         start = torch.from_numpy(self.rng.normal(size=(rows, columns)).astype(np.float32))
         self.dense = start.clone().requires_grad_()
-        self.adam = Adam({"x": self.dense})
-        self.lazy = RowAdam(start.clone())
+        self.adam = Adam({"x": self.dense}, pace)
+        self.lazy = RowAdam(start.clone(), pace)
+        self.pace = pace
         self.way = 0.0
 
     def step(self, share: float, rate: float, scale: float = 1.0) -> None:
@@ -40,7 +41,7 @@ class Both:
         self.dense.grad[rows] = leaf.grad
         self.lazy.step(rate)
         self.adam.step({"x": rate})
-        self.way += 4 * rate
+        self.way += 4 * self.pace.views * rate
 
     @property
     def tolerance(self) -> float:
@@ -57,19 +58,21 @@ class Both:
     steps=st.lists(st.tuples(st.floats(0, 1), st.floats(1e-5, 0.1)), min_size=1, max_size=40),
     scale=st.sampled_from([1e-7, 1e-3, 1.0, 1e4]),
     seed=st.integers(0, 1000),
+    views=st.sampled_from([1, 4]),
 )
 def test_waiting_rows_end_where_adam_takes_them(
-    steps: list[tuple[float, float]], scale: float, seed: int
+    steps: list[tuple[float, float]], scale: float, seed: int, views: int
 ) -> None:
-    both = Both(7, 9, seed)
+    both = Both(7, 9, seed, Pace(views))
     for share, rate in steps:
         both.step(share, rate, scale)
     both.compare()
 
 
-def test_rows_may_wait_longer_than_the_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("views", [1, 3])
+def test_rows_may_wait_longer_than_the_horizon(views: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Some for ever, some until the end."""
-    both = Both(6, 4, seed=3)
+    both = Both(6, 4, 3, Pace(views))
     both.step(1.0, 0.01)
     monkeypatch.setattr(both, "rng", np.random.default_rng(1))
     for index in range(row_adam._HORIZON + 60):
