@@ -211,9 +211,10 @@ class FieldMethod(ABC):
         """Evaluate the field at samples and sum along the rays; returns mean distances, too."""
         if not torch.is_grad_enabled():
             return self._draw_until_opaque(rays, samples, codes)
-        given, directions = map(self.tensor, samples[:3]), self.tensor(rays.directions)
-        seen = self._seen(*given, samples.starts, directions, codes)
-        densities, values, lengths, distances, groups = seen
+        places, lengths, distances = map(self.tensor, samples[:3])
+        densities, values, lengths, distances, groups = self._seen(
+            places, lengths, distances, samples.starts, self.tensor(rays.directions), codes
+        )
         sums, opacities = composite(densities, values, lengths, groups)
         with torch.no_grad():
             reach, _ = composite(densities.detach(), distances[:, None], lengths, groups)
@@ -232,10 +233,11 @@ class FieldMethod(ABC):
             taken = np.minimum(counts[going] - done, most)
             starts = np.concatenate(([0], np.cumsum(taken)))
             first, these = samples.starts[going] + done, self.tensor(going)
-            parts = (part_rows(x, first, starts) for x in given)
+            places, lengths, distances = (part_rows(x, first, starts) for x in given)
             code, clear = Codes(*(code[these] for code in codes)), front.clear[these]
-            seen = self._seen(*parts, starts, directions[these], code, clear)
-            densities, values, lengths, distances, groups = seen
+            densities, values, lengths, distances, groups = self._seen(
+                places, lengths, distances, starts, directions[these], code, clear
+            )
             values = torch.cat((values, distances[:, None]), dim=1)
             front.add(these, densities, values, lengths, groups)
             done += most
