@@ -29,16 +29,20 @@ _BLOCK = 64  # Rays per task
 
 
 def composite_reference(
-    densities: Tensor, values: Tensor, lengths: Tensor, groups: Groups
+    densities: Tensor, values: Tensor, lengths: Tensor, groups: Groups, clear: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Sum along rays in plain torch: the definition of `composite`."""
+    """Sum along rays in plain torch: the definition of `composite`.
+
+    Args:
+        clear: Transmittance before the first sample, if not 1. [R]
+    """
     depths = densities * lengths
     before = torch.cumsum(depths, 0) - depths  # of all rays, so that of the ray's start goes off
     before = before - before[groups.starts[:-1].clamp_max(len(depths) - 1)][groups.of_row.long()]
-    clear = torch.exp(-before)
-    weights = torch.where(clear >= STOP, clear * (1 - torch.exp(-depths)), 0.0)
-    rays = len(groups.starts) - 1
     index = groups.of_row.long()
+    passed = torch.exp(-before) if clear is None else torch.exp(-before) * clear[index]
+    weights = torch.where(passed >= STOP, passed * (1 - torch.exp(-depths)), 0.0)
+    rays = len(groups.starts) - 1
     shape = (rays, values.shape[1])
     sums = values.new_zeros(shape).index_add(0, index, weights[:, None] * values)
     return sums, weights.new_zeros(rays).index_add(0, index, weights)
@@ -75,45 +79,43 @@ class _Composite(torch.autograd.Function):
         ctx: Any, densities: Tensor, values: Tensor, lengths: Tensor, groups: Groups
     ) -> tuple[Tensor, Tensor]:
         rays, channels = len(groups.starts) - 1, values.shape[1]
-        sums, opacities = torch.empty(rays, channels), torch.empty(rays)
+        sums, clear = torch.zeros(rays, channels), torch.ones(rays)
         given = [t.detach().contiguous().numpy() for t in (densities, values, lengths)]
         starts = groups.starts.numpy()
-        _composite_forward(*given, starts, sums.numpy(), opacities.numpy())
-        ctx.kept = *given, starts, opacities
-        return sums, opacities
+        _composite_forward(*given, starts, np.arange(rays), sums.numpy(), clear.numpy())
+        ctx.kept = *given, starts
+        return sums, 1 - clear
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        densities, values, lengths, starts, opacities = ctx.kept
+        densities, values, lengths, starts = ctx.kept
         d_densities, d_values = np.zeros_like(densities), np.zeros_like(values)
         given = [g.contiguous().numpy() for g in grads]
-        _composite_backward(
-            densities, values, lengths, starts, opacities.numpy(), *given, d_densities, d_values
-        )
+        _composite_backward(densities, values, lengths, starts, *given, d_densities, d_values)
         return torch.from_numpy(d_densities), torch.from_numpy(d_values), None, None
 
 
 @kernel(fast_math=True, parallel=True)
-def _composite_forward(densities, values, lengths, starts, sums, opacities):  # type: ignore[no-untyped-def]
-    rays, channels, stop = len(starts) - 1, values.shape[1], float32(STOP)
-    for block in prange((rays + _BLOCK - 1) // _BLOCK):
-        for ray in range(block * _BLOCK, min(rays, (block + 1) * _BLOCK)):
-            for c in range(channels):
-                sums[ray, c] = _ZERO
-            clear = _ONE
-            for i in range(starts[ray], starts[ray + 1]):
+def _composite_forward(densities, values, lengths, starts, rays, sums, transmittance):  # type: ignore[no-untyped-def]
+    """Go on with the sums and transmittances of some rays, by the number of each group's ray."""
+    groups, channels, stop = len(starts) - 1, values.shape[1], float32(STOP)
+    for block in prange((groups + _BLOCK - 1) // _BLOCK):
+        for group in range(block * _BLOCK, min(groups, (block + 1) * _BLOCK)):
+            ray = rays[group]
+            clear = transmittance[ray]
+            for i in range(starts[group], starts[group + 1]):
                 if clear < stop:
                     break
                 after = clear * math.exp(-densities[i] * lengths[i])
                 for c in range(channels):
                     sums[ray, c] += (clear - after) * values[i, c]
                 clear = after
-            opacities[ray] = _ONE - clear
+            transmittance[ray] = clear
 
 
 @kernel(fast_math=True, parallel=True)
 def _composite_backward(  # type: ignore[no-untyped-def]
-    densities, values, lengths, starts, opacities, grads, d_opacities, d_densities, d_values
+    densities, values, lengths, starts, grads, d_opacities, d_densities, d_values
 ):
     """Write gradients: dL/ds_j = d_j (T_{j+1} g v_j - sum_{k>j} w_k g v_k + T_end dL/do)."""
     rays, channels, stop = len(starts) - 1, values.shape[1], float32(STOP)
@@ -139,29 +141,66 @@ def _composite_backward(  # type: ignore[no-untyped-def]
                 behind += shade
 
 
+class Front:
+    """What rays have gathered so far, from the camera on; nothing of it is differentiated.
+
+    Samples that are added in several parts give the bits of `composite` with all of them.
+
+    Args:
+        rays: R
+        device: Device of the sums.
+    """
+
+    def __init__(self, rays: int, device: str) -> None:
+        self.sums = torch.zeros(rays, 0, device=device)
+        """[R, C], C as in what was added."""
+        self.clear = torch.ones(rays, device=device)
+        """Transmittances. [R]"""
+
+    def add(
+        self, rays: Tensor, densities: Tensor, values: Tensor, lengths: Tensor, groups: Groups
+    ) -> None:
+        """Add samples of some rays, by the number of each group's ray; others as `composite`."""
+        if self.sums.shape[1] == 0:
+            self.sums = values.new_zeros(len(self.clear), values.shape[1])
+        if devices.has_kernels(densities, values, lengths):
+            given = [t.contiguous().numpy() for t in (densities, values, lengths, groups.starts)]
+            _composite_forward(*given, rays.numpy(), self.sums.numpy(), self.clear.numpy())
+            return
+        found = composite_reference(densities, values, lengths, groups, self.clear[rays])
+        self.sums[rays] += found[0]
+        self.clear[rays] -= found[1]
+
+
 @torch.no_grad()
-def visible(densities: Tensor, lengths: Tensor, groups: Groups) -> tuple[Tensor, NDArray[np.int64]]:
-    """Find the samples that have a weight: the first ones of each ray.
+def visible(
+    densities: Tensor, lengths: Tensor, groups: Groups, clear: Tensor | None = None
+) -> NDArray[np.int64]:
+    """Count the samples that have a weight: the first ones of each ray.
+
+    Args:
+        densities: Not negative. [N]
+        lengths: Lengths of the samples. [N]
+        groups: Samples of each ray, near ones first.
+        clear: Transmittance before the first of them, if not 1. [R]
 
     Returns:
-        seen: Their numbers, ascending. int64 [K]
         starts: First of each ray among them, and the number of all. [R + 1]
     """
-    given = [t.detach().cpu().contiguous().numpy() for t in (densities, lengths)]
+    clear = densities.new_ones(len(groups.starts) - 1) if clear is None else clear
+    given = [t.detach().cpu().contiguous().numpy() for t in (densities, lengths, clear)]
     starts = groups.starts.cpu().numpy()
     counts = np.zeros(len(starts), np.int64)
     _count_visible(*given, starts, counts)
-    ends = np.cumsum(counts)
-    first = np.repeat(starts[:-1] - ends[:-1], counts[1:])
-    return torch.from_numpy(np.arange(ends[-1]) + first).to(densities.device), ends
+    return np.cumsum(counts)
 
 
 @kernel(fast_math=True, parallel=True)
-def _count_visible(densities, lengths, starts, counts):  # type: ignore[no-untyped-def]
+def _count_visible(densities, lengths, before, starts, counts):  # type: ignore[no-untyped-def]
     rays, stop = len(starts) - 1, float32(STOP)
     for block in prange((rays + _BLOCK - 1) // _BLOCK):
         for ray in range(block * _BLOCK, min(rays, (block + 1) * _BLOCK)):
-            clear, end = _ONE, starts[ray]
+            clear, end = before[ray], starts[ray]
             while end < starts[ray + 1] and clear >= stop:
                 clear *= math.exp(-densities[end] * lengths[end])
                 end += 1
@@ -173,12 +212,14 @@ class _TruncatedExp(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor) -> Tensor:
         # NumPy makes one pass, where torch may take another path at the end of a thread's share.
         clipped = x.detach().clamp(max=_LIMIT).contiguous()
-        ctx.slope = clipped.exp() if x.is_cuda else torch.from_numpy(np.exp(clipped.numpy()))
-        return ctx.slope.clone()
+        out = clipped.exp() if x.is_cuda else torch.from_numpy(np.exp(clipped.numpy()))
+        ctx.save_for_backward(out)
+        return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        return grads[0] * ctx.slope
+        (slope,) = ctx.saved_tensors
+        return grads[0] * slope
 
 
 class _Softplus(torch.autograd.Function):

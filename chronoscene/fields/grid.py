@@ -18,6 +18,7 @@ from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.fields.grid_kernels import encode_backward, encode_forward
+from chronoscene.kernels.vectors import LANES
 from chronoscene.training import devices
 
 FEATURES = 2
@@ -101,19 +102,24 @@ class _Encode(torch.autograd.Function):
         out = torch.empty(len(places), layout.width)
         levels = layout.resolutions, layout.starts, layout.dense
         flat = table.detach().contiguous().view(-1).numpy()
-        tasks = numba.get_num_threads()
-        encode_forward(places.numpy(), flat, *levels, tasks, out.view(-1).numpy())
-        ctx.places, ctx.levels = places, levels
+        given = _padded(places.numpy()), len(places)
+        encode_forward(*given, flat, *levels, numba.get_num_threads(), out.view(-1).numpy())
+        ctx.given, ctx.levels = given, levels
         return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        rows = int(ctx.levels[1][-1])
-        out = torch.zeros(rows, FEATURES)
-        tasks = numba.get_num_threads()
+        out = torch.zeros(int(ctx.levels[1][-1]), FEATURES)
         given = grads[0].contiguous().view(-1).numpy()
-        encode_backward(ctx.places.numpy(), given, *ctx.levels, tasks, out.view(-1).numpy())
+        by_level = np.empty(len(given) + 2 * LANES, np.float32)
+        rest = numba.get_num_threads(), by_level, out.view(-1).numpy()
+        encode_backward(*ctx.given, given, *ctx.levels, *rest)
         return out, None, None
+
+
+def _padded(places: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Flat places with zeros up to a multiple of LANES rows."""
+    return np.append(places, np.zeros((-len(places) % LANES, 3), np.float32))
 
 
 def encode(places: Tensor, table: Tensor, layout: GridLayout) -> Tensor:

@@ -18,6 +18,7 @@ NEAR = 0.01
 _BLOCK = 64  # Rays per task
 _FAR = float32(1e9)
 _TINY = float32(1e-9)
+_MOST = 1 << 62
 _LAST = float32(0.99999)  # Largest coordinate in the unit cube
 ZERO, ONE, TWO = float32(0), float32(1), float32(2)
 
@@ -64,7 +65,19 @@ def march(
     rays = len(origins)
     starts = np.zeros(rays + 1, np.int64)
     nothing = np.empty((0, 3), np.float32), np.empty(0, np.float32), np.empty(0, np.float32)
-    fixed = (origins, directions, periods, jitter, *grids, sides, float32(step), shells, starts)
+    found = np.empty(rays, np.float32), np.empty(rays, np.int64)
+    fixed = (
+        origins,
+        directions,
+        periods,
+        jitter,
+        *grids,
+        sides,
+        float32(step),
+        shells,
+        *found,
+        starts,
+    )
     _march(*fixed, False, *nothing)
     np.cumsum(starts, out=starts)
     count = int(starts[-1])
@@ -104,10 +117,14 @@ def _outer_place(ox, oy, oz, dx, dy, dz, start, share):  # type: ignore[no-untyp
 
 @kernel(fast_math=True, parallel=True)
 def _march(  # type: ignore[no-untyped-def]
-    origins, directions, periods, jitter, inside, outside, sides, step, shells, starts, fill,
-    places, lengths, distances,
+    origins, directions, periods, jitter, inside, outside, sides, step, shells, firsts, counts,
+    starts, fill, places, lengths, distances,
 ):  # fmt: skip
-    """Count the samples of each ray into ``starts[1:]``, or write them from ``starts`` on."""
+    """Count the samples of each ray into ``starts[1:]``, or write them from ``starts`` on.
+
+    Between the two passes ``firsts`` keeps the distance of the first sample in the box, and
+    ``counts`` the number of those there: most of the way to it and behind the last is empty.
+    """
     rays, cells, outer_cells = len(origins), inside.shape[1], outside.shape[1]
     half = float32(cells) / TWO
     cell = ONE / half
@@ -117,14 +134,16 @@ def _march(  # type: ignore[no-untyped-def]
             dx, dy, dz = directions[ray]
             period, at = periods[ray], starts[ray] if fill else 0
             near, far = _enter(ox, oy, oz, dx, dy, dz, sides)
-            t = near + jitter[ray] * step
-            while t < far:
+            first, end = _FAR, at + counts[ray] if fill else _MOST
+            t = firsts[ray] if fill else near + jitter[ray] * step
+            while t < far and at < end:
                 x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
                 gx, gy, gz = (x + ONE) * half, (y + ONE) * half, (z + ONE) * half
                 i = min(max(int(gx), 0), cells - 1)
                 j = min(max(int(gy), 0), cells - 1)
                 k = min(max(int(gz), 0), cells - 1)
                 if inside[period, i, j, k]:
+                    first = min(first, t)
                     if fill:
                         px, py, pz = contract(x, y, z)
                         places[at, 0], places[at, 1], places[at, 2] = px, py, pz
@@ -137,6 +156,8 @@ def _march(  # type: ignore[no-untyped-def]
                     min(_leave_cell(gy, dy, cell), _leave_cell(gz, dz, cell)),
                 )
                 t += max(ONE, float32(math.ceil(out / step))) * step
+            if not fill:
+                firsts[ray], counts[ray] = first, at
             start = far if far > near else float32(NEAR)
             for shell in range(shells):
                 share = (float32(shell) + jitter[ray]) / float32(shells)

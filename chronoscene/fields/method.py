@@ -16,13 +16,14 @@ from torch import Tensor
 
 from chronoscene.errors import ShapeError
 from chronoscene.fields.box import SceneBox, box_of, sensible_cells
-from chronoscene.fields.compositing import STOP, composite, visible
+from chronoscene.fields.compositing import STOP, Front, composite, visible
 from chronoscene.fields.config import FieldConfig
 from chronoscene.fields.marching import Samples, march
-from chronoscene.fields.mlp import make_groups
+from chronoscene.fields.mlp import Groups, make_groups
 from chronoscene.fields.network import Codes, FieldNetwork
 from chronoscene.fields.occupancy import INTERVAL, Occupancy, start_occupancy
 from chronoscene.fields.rays import PixelPool, Rays, view_rays
+from chronoscene.fields.rows import part_rows
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
 from chronoscene.training.checkpoint import (
     TRAINING,
@@ -38,9 +39,9 @@ from chronoscene.training.periods import period_weights
 
 _FIRST_RAYS, _FEWEST_RAYS = 256, 64
 _PIXELS_PER_RAY = 64
-_RENDERED_RAYS = 8_192  # At a time; each level of a grid is read once for all of them
-_AT_A_TIME = 16  # Samples of a ray that are evaluated before it is asked whether it goes on
-_OPAQUE = 0.1 - math.log(STOP)  # Optical depth; not the exact one, which is rounded elsewhere
+_RENDERED_RAYS = 16_384  # At a time
+_RENDERED_SAMPLES = 131_072  # At a time; each level of a grid is read once for all of them
+_AT_A_TIME = 16  # Samples of a ray, at most, before it is asked whether it goes on
 _STREAM = 1_000  # Number of the random draws of a step, after the seed
 _GRIDS = ("inside", "outside")
 
@@ -208,51 +209,78 @@ class FieldMethod(ABC):
 
     def draw(self, rays: Rays, samples: Samples, codes: Codes) -> tuple[Drawn, Tensor]:
         """Evaluate the field at samples and sum along the rays; returns mean distances, too."""
-        groups = make_groups(samples.starts, self.device)
-        places, lengths = self.tensor(samples.places), self.tensor(samples.lengths)
-        distances = self.tensor(samples.distances)
-        if torch.is_grad_enabled():
-            densities, features = self.network.density(places, groups, codes.geometry)
-        else:
-            densities, features = self._until_opaque(places, lengths, samples.starts, codes)
-        seen, starts = visible(densities, lengths, groups)
-        if len(seen) < len(places):  # what is hidden has no weight and no gradient
-            groups = make_groups(starts, self.device)
-            densities, features = densities.index_select(0, seen), features.index_select(0, seen)
-            places, lengths, distances = places[seen], lengths[seen], distances[seen]
-        directions = self.tensor(rays.directions)
-        values = self.network.values(features, places, groups, directions, codes.color)
+        if not torch.is_grad_enabled():
+            return self._draw_until_opaque(rays, samples, codes)
+        places, lengths, distances = map(self.tensor, samples[:3])
+        densities, values, lengths, distances, groups = self._seen(
+            places, lengths, distances, samples.starts, self.tensor(rays.directions), codes
+        )
         sums, opacities = composite(densities, values, lengths, groups)
         with torch.no_grad():
             reach, _ = composite(densities.detach(), distances[:, None], lengths, groups)
         return Drawn(sums, opacities, self.background), reach[:, 0]
 
-    def _until_opaque(
-        self, places: Tensor, lengths: Tensor, starts: NDArray[np.int64], codes: Codes
-    ) -> tuple[Tensor, Tensor]:
-        """Evaluate densities and features from the camera on, until nothing behind is seen.
-
-        What is behind has the density 0, and features that mean nothing.
-        """
-        densities, features = torch.zeros_like(lengths), places.new_empty(len(places), 0)
-        counts, done = np.diff(starts), 0
-        depths = np.zeros(len(counts), np.float32)
+    def _draw_until_opaque(
+        self, rays: Rays, samples: Samples, codes: Codes
+    ) -> tuple[Drawn, Tensor]:
+        """Do the same from the camera on, each ray until nothing behind is seen; equal bits."""
+        front, directions = Front(len(rays.views), self.device), self.tensor(rays.directions)
+        given = tuple(map(self.tensor, samples[:3]))
+        counts, done = np.diff(samples.starts), 0
         going = np.flatnonzero(counts)
-        while len(going):
-            taken = np.minimum(counts[going] - done, _AT_A_TIME)
-            ends = np.concatenate(([0], np.cumsum(taken)))
-            first = starts[going] + done - ends[:-1]
-            chosen = self.tensor(np.arange(ends[-1]) + np.repeat(first, taken))
-            groups, code = make_groups(ends, self.device), codes.geometry[self.tensor(going)]
-            found, values = self.network.density(places[chosen], groups, code)
-            if features.shape[1] == 0:
-                features = values.new_empty(len(places), values.shape[1])
-            densities[chosen], features[chosen] = found, values
-            passed = (found * lengths[chosen]).cpu().numpy()
-            depths[going] += np.add.reduceat(passed, ends[:-1])
-            done += _AT_A_TIME
-            going = going[(depths[going] < _OPAQUE) & (counts[going] > done)]
-        return densities, features
+        while done == 0 or len(going):
+            most = min(_AT_A_TIME, _RENDERED_SAMPLES // max(len(going), 1))
+            taken = np.minimum(counts[going] - done, most)
+            starts = np.concatenate(([0], np.cumsum(taken)))
+            first, these = samples.starts[going] + done, self.tensor(going)
+            places, lengths, distances = (part_rows(x, first, starts) for x in given)
+            code, clear = Codes(*(code[these] for code in codes)), front.clear[these]
+            densities, values, lengths, distances, groups = self._seen(
+                places, lengths, distances, starts, directions[these], code, clear
+            )
+            values = torch.cat((values, distances[:, None]), dim=1)
+            front.add(these, densities, values, lengths, groups)
+            done += most
+            going = going[(front.clear.cpu().numpy()[going] >= STOP) & (counts[going] > done)]
+        return Drawn(front.sums[:, :-1], 1 - front.clear, self.background), front.sums[:, -1]
+
+    def _seen(
+        self,
+        places: Tensor,
+        lengths: Tensor,
+        distances: Tensor,
+        starts: NDArray[np.int64],
+        directions: Tensor,
+        codes: Codes,
+        clear: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Groups]:
+        """Evaluate densities, and values where something is seen.
+
+        What is hidden has no weight and no gradient, and is left out.
+
+        Args:
+            places: In the unit cube. [N, 3]
+            lengths: [N]
+            distances: [N]
+            starts: First sample of each ray, and the number of all. [R + 1]
+            directions: [R, 3]
+            codes: [R, ...]
+            clear: Transmittance before the first sample of each ray, if not 1. [R]
+
+        Returns:
+            Densities, values, lengths, distances and groups of the samples that are seen.
+        """
+        groups = make_groups(starts, self.device)
+        densities, features = self.network.density(places, groups, codes.geometry)
+        ends = visible(densities, lengths, groups, clear)
+        if ends[-1] < len(places):
+            groups = make_groups(ends, self.device)
+            every = densities, features, places, lengths, distances
+            densities, features, places, lengths, distances = (
+                part_rows(x, starts[:-1], ends) for x in every
+            )
+        values = self.network.values(features, places, groups, directions, codes.color)
+        return densities, values, lengths, distances, groups
 
     @torch.no_grad()
     def probe(self, places: NDArray[np.float32], period: int) -> NDArray[np.float32]:

@@ -168,11 +168,9 @@ class _Mlp(torch.autograd.Function):
         starts = groups.starts.numpy()
         places = starts, groups.of_row.numpy(), _chunks(starts, about.size)
         fixed = about, _pack(about, layers), _flat(x), _flat(shared), *places
-        learns = any(ctx.needs_input_grad)
-        acts = np.empty(len(x) * about.row if learns else 0, np.float32)
         out = torch.empty(len(x), about.outputs)
-        mlp_forward(*fixed, acts, _flat(out))
-        ctx.kept = (*fixed, acts, _flat(out)), layers, (x.shape, shared.shape)
+        mlp_forward(*fixed, _flat(out))
+        ctx.kept = (*fixed, _flat(out)), layers, (x.shape, shared.shape)
         return out
 
     @staticmethod

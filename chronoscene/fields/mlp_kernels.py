@@ -2,7 +2,8 @@
 
 Rows are in groups, a ray with its samples each. Input that all rows of a group share goes through
 its part of the first layer once. A chunk is some groups that follow each other; it has gradients of
-the weights of its own, which are summed in the order of the chunks.
+the weights of its own, which are summed in the order of the chunks. The backward pass computes
+hidden layers again, block by block: that takes less time than to write and read them all.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import prange
-from numpy import empty, float32
+from numpy import empty, empty_like, float32
 from numpy.typing import NDArray
 
 from chronoscene.kernels.compilation import inner, kernel
@@ -42,14 +43,14 @@ class Layers(NamedTuple):
     bias: NDArray[np.int64]
     """[K]"""
     hidden: NDArray[np.int64]
-    """Place of each hidden layer among the activations, in numbers of a row. [K]"""
+    """Place of each hidden layer among those of a row. [K]"""
     inputs: int
     outputs: int
     shared: int
     """Numbers that a group shares."""
     shared_pad: int
     row: int
-    """Activations of a row, in all hidden layers."""
+    """Numbers of a row in all hidden layers."""
     size: int
     """Numbers of all weights without the transposes: they come last."""
     sigmoid: bool
@@ -79,15 +80,38 @@ def _shared_part(layers, weights, shared, first, last, work, out):  # type: igno
 
 
 @inner
-def _kept(layers, acts, rows, layer, row):  # type: ignore[no-untyped-def]
-    """Activations of a hidden layer from a row on, as a matrix."""
-    width = layers.widths[layer + 1]
-    return acts, rows * layers.hidden[layer] + row * width, width
+def _layer(layers, weights, layer, left, into, common, groups, row, count):  # type: ignore[no-untyped-def]
+    """Send a block of rows through a layer; ``common`` is the shared part, from its first group."""
+    inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
+    matrix, bias = (weights, layers.matrix[layer], outputs), (weights, layers.bias[layer], 0)
+    if layer == 0:
+        for i in range(BLOCK):
+            place = (groups[row + min(i, count - 1)] - common[1]) * outputs
+            for c in range(0, outputs, LANES):
+                store(into[0], into[1] + i * outputs + c, load(common[0], place + c))
+        bias = into
+    if layer == len(layers.widths) - 2:
+        product(left, matrix, bias, into, BLOCK, outputs, inputs)
+    else:
+        relu_product(left, matrix, bias, into, BLOCK, outputs, inputs)
+
+
+@inner
+def _hidden_layers(layers, weights, x, common, groups, row, count, block, hidden):  # type: ignore[no-untyped-def]
+    """Copy a block of rows to ``block`` and compute its hidden layers, one after the other."""
+    _copy_rows(x, row, layers.inputs, block, layers.widths[0], count)
+    left = (block, 0, layers.widths[0], 1)
+    for layer in range(len(layers.widths) - 2):
+        width = layers.widths[layer + 1]
+        into = (hidden, BLOCK * layers.hidden[layer], width)
+        _layer(layers, weights, layer, left, into, common, groups, row, count)
+        left = (into[0], into[1], width, 1)
+    return left
 
 
 @kernel(parallel=True)
-def mlp_forward(layers, weights, x, shared, starts, groups, chunks, acts, out):  # type: ignore[no-untyped-def]
-    """Compute the outputs of all rows, and keep the hidden layers.
+def mlp_forward(layers, weights, x, shared, starts, groups, chunks, out):  # type: ignore[no-untyped-def]
+    """Compute the outputs of all rows.
 
     Args:
         layers: `Layers`.
@@ -97,50 +121,25 @@ def mlp_forward(layers, weights, x, shared, starts, groups, chunks, acts, out): 
         starts: First row of each group, and the end. int64 [R + 1]
         groups: Group of each row. int32 [N]
         chunks: First group of each chunk, and the end. int64 [C + 1]
-        acts: Hidden layers one after the other, written if not empty. Flat [N x row]
         out: Flat [N, O], written.
     """
     depth = len(layers.widths) - 1
-    keep = acts.shape[0] > 0
+    width = layers.widths[depth]
     for chunk in prange(len(chunks) - 1):
         first, last = chunks[chunk], chunks[chunk + 1]
-        hidden = layers.widths[1]
-        common = empty((last - first + BLOCK) * hidden, float32)
-        work = empty(BLOCK * max(layers.shared_pad, layers.widths.max()), float32)
-        other = empty(BLOCK * layers.widths.max(), float32)
+        common = empty((last - first + BLOCK) * layers.widths[1], float32)
+        work = empty(BLOCK * max(layers.shared_pad, layers.widths[0]), float32)
+        hidden, outputs = empty(BLOCK * layers.row, float32), empty(BLOCK * width, float32)
         _shared_part(layers, weights, shared, first, last, work, common)
         for row in range(starts[first], starts[last], BLOCK):
             count = min(BLOCK, starts[last] - row)
-            _copy_rows(x, row, layers.inputs, work, layers.widths[0], count)
-            left = (work, 0, layers.widths[0], 1)
-            for layer in range(depth):
-                inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
-                into = (other if layer % 2 == 0 else work, 0, outputs)
-                kept = _kept(layers, acts, starts[-1], layer, row)
-                # The last block of a chunk is longer than the chunk.
-                straight = keep and layer < depth - 1 and count == BLOCK
-                if straight:
-                    into = kept
-                matrix = (weights, layers.matrix[layer], outputs)
-                bias = (weights, layers.bias[layer], 0)
-                if layer == 0:
-                    for i in range(BLOCK):
-                        place = (groups[row + min(i, count - 1)] - first) * hidden
-                        for c in range(0, hidden, LANES):
-                            store(into[0], into[1] + i * hidden + c, load(common, place + c))
-                    bias = into
-                if layer == depth - 1:
-                    product(left, matrix, bias, into, BLOCK, outputs, inputs)
-                else:
-                    relu_product(left, matrix, bias, into, BLOCK, outputs, inputs)
-                if keep and layer < depth - 1 and not straight:
-                    for i in range(0, count * outputs, LANES):
-                        store(acts, kept[1] + i, load(into[0], i))
-                left = (into[0], into[1], outputs, 1)
-            width = layers.widths[depth]
+            about = (common, first)
+            left = _hidden_layers(layers, weights, x, about, groups, row, count, work, hidden)
+            into = (outputs, 0, width)
+            _layer(layers, weights, depth - 1, left, into, about, groups, row, count)
             for i in range(count):
                 for c in range(0, width, LANES):
-                    value = load(left[0], i * width + c)
+                    value = load(outputs, i * width + c)
                     if layers.sigmoid:
                         value = sigmoid(value)
                     store_first(out, (row + i) * layers.outputs + c, value, layers.outputs - c)
@@ -205,7 +204,7 @@ def _shared_gradient(layers, weights, shared, first, last, work, common, part, d
 
 @kernel(parallel=True)
 def mlp_backward(  # type: ignore[no-untyped-def]
-    layers, weights, x, shared, starts, groups, chunks, acts, out, grads, partial, d_x, d_shared
+    layers, weights, x, shared, starts, groups, chunks, out, grads, partial, d_x, d_shared
 ):
     """Write gradients of what `mlp_forward` reads; arguments as there, and these.
 
@@ -226,24 +225,20 @@ def mlp_backward(  # type: ignore[no-untyped-def]
         current, other = empty(BLOCK * widest, float32), empty(BLOCK * widest, float32)
         zeros = empty(widest, float32)
         set_zero(zeros, 0, widest)
+        entering, acts = empty_like(common), empty(BLOCK * layers.row, float32)
+        _shared_part(layers, weights, shared, first, last, work, entering)
         for row in range(starts[first], starts[last], BLOCK):
             count = min(BLOCK, starts[last] - row)
             d, before = current, other
             if not _output_gradient(layers, out, grads, row, count, d):
                 continue
+            about = (entering, first)
+            _hidden_layers(layers, weights, x, about, groups, row, count, work, acts)
             for layer in range(depth - 1, -1, -1):
                 inputs, outputs = layers.widths[layer], layers.widths[layer + 1]
-                left = (work, 0, inputs)
-                if layer == 0:
-                    _copy_rows(x, row, layers.inputs, work, inputs, count)
-                else:
-                    kept = _kept(layers, acts, starts[-1], layer - 1, row)
-                    if count == BLOCK:
-                        left = kept
-                    else:
-                        for i in range(0, count * inputs, LANES):
-                            store(work, i, load(acts, kept[1] + i))
-                        set_zero(work, count * inputs, BLOCK * inputs)
+                left = (work, 0)
+                if layer:
+                    left = (acts, BLOCK * layers.hidden[layer - 1])
                 turned = (left[0], left[1], 1, inputs)
                 into = (part, layers.matrix[layer], outputs)
                 product(turned, (d, 0, outputs), into, into, inputs, outputs, BLOCK)

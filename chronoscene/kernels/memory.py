@@ -153,6 +153,26 @@ def store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     emit_store(builder, args[2], emit_address(context, builder, sig.args[0], *args[:2]))
 
 
+def _make_load_pairs(upper: bool) -> Callable:
+    @emitted(lambda memory, rows: Vector("f32", rows.lanes)(memory, rows))
+    def load_pairs(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Two numbers of each row of [.., 2] that half of the lanes name; rows are int32."""
+        half = sig.args[1].lanes // 2
+        start = emit_address(context, builder, sig.args[0], args[0], _I64(0))
+        start = builder.bitcast(start, _I64.as_pointer())
+        pairs = ir.Constant(ir.VectorType(_I64, half), ir.Undefined)
+        for i in range(half):
+            row = builder.extract_element(args[1], I32(half * upper + i))
+            pair = builder.load(builder.gep(start, [builder.zext(row, _I64)]), align=4)
+            pairs = builder.insert_element(pairs, pair, I32(i))
+        return builder.bitcast(pairs, sig.return_type.llvm)
+
+    return load_pairs
+
+
+load_low_pairs, load_high_pairs = _make_load_pairs(upper=False), _make_load_pairs(upper=True)
+
+
 @emitted(lambda array, offset, mask, value: types.void(array, types.intp, mask, value))
 def store_where(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Write the lanes of a vector whose mask is set. The others are written too, as they were."""

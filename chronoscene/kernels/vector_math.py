@@ -75,6 +75,10 @@ quad_heads = _make_permutation(lambda i, lanes: 4 * i % lanes)
 """The first of each four lanes, moved to the front."""
 quad_spread = _make_permutation(lambda i, lanes: i // 4)
 """The first lanes, each four times: the reverse of `quad_heads`."""
+low_pairs = _make_permutation(lambda i, lanes: i // 2)
+"""The lanes of the first half, each twice."""
+high_pairs = _make_permutation(lambda i, lanes: (lanes + i) // 2)
+"""The lanes of the second half, each twice."""
 
 
 @inner

@@ -195,7 +195,7 @@ def _promote(context: Any, builder: Any, kinds: Any, args: Any) -> tuple[Vector,
 
 _COMPARISONS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 _ARITHMETIC = {"add": "add", "sub": "sub", "mul": "mul", "truediv": "div"}
-_BITWISE = {"and_": "and_", "or_": "or_", "lshift": "shl", "rshift": "ashr"}
+_BITWISE = {"and_": "and_", "or_": "or_", "xor": "xor", "lshift": "shl", "rshift": "ashr"}
 
 
 def _emit_operator(builder: Any, kind: str, name: str, a: Any, b: Any) -> Any:

@@ -9,9 +9,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from chronoscene.fields.compositing import STOP, composite, composite_reference, truncated_exp
+from chronoscene.fields.compositing import (
+    STOP,
+    Front,
+    composite,
+    composite_reference,
+    truncated_exp,
+    visible,
+)
 from chronoscene.fields.grid import GridLayout, encode, encode_reference
 from chronoscene.fields.mlp import Groups, initial_layers, make_groups, mlp, mlp_reference
+from chronoscene.fields.rows import part_rows
 from chronoscene.kernels.runtime import set_threads
 
 LAYOUT = GridLayout(levels=4, log2_rows=10, base=4, finest=40)
@@ -112,6 +120,51 @@ def test_composite() -> None:
         return joined
 
     assert_like_reference(both(composite), both(composite_reference), [densities, values])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_samples_added_in_parts_are_like_all_at_once(dtype: torch.dtype) -> None:
+    """With kernels to the bit: a render shows what a training sees."""
+    generator = torch.Generator().manual_seed(5)
+    groups = some_groups([9, 0, 40, 17] * 30)
+    starts, count = groups.starts.numpy(), int(groups.starts[-1])
+    densities = torch.rand(count, generator=generator, dtype=dtype) * 60
+    lengths = torch.rand(count, generator=generator, dtype=dtype) * 0.02
+    values = torch.rand(count, 3, generator=generator, dtype=dtype)
+    sums, opacities = composite(densities, values, lengths, groups)
+    assert 0.2 < float((opacities > 1 - STOP).double().mean()) < 0.9
+    front, done = Front(len(starts) - 1, "cpu"), 0
+    if dtype == torch.float64:
+        front.clear = front.clear.double()
+    while done < 40:
+        going = np.flatnonzero(np.diff(starts) > done)
+        taken = np.minimum(np.diff(starts)[going] - done, 7)
+        ends = np.concatenate(([0], np.cumsum(taken)))
+        parts = (part_rows(x, starts[going] + done, ends) for x in (densities, values, lengths))
+        front.add(torch.from_numpy(going), *parts, make_groups(ends))
+        done += 7
+    exact = {"rtol": 0, "atol": 0} if dtype == torch.float32 else {}
+    torch.testing.assert_close(front.sums, sums, **exact)
+    torch.testing.assert_close(1 - front.clear, opacities, **exact)
+
+
+def test_what_is_visible_depends_on_what_is_in_front() -> None:
+    groups, depths = some_groups([3, 3]), torch.full((6,), 5.0)
+    ends = visible(depths, torch.ones(6), groups)
+    assert ends.tolist() == [0, 2, 4]  # exp(-5) is above the limit, exp(-10) below
+    ends = visible(depths, torch.ones(6), groups, torch.tensor([1e-3, 1e-5]))
+    assert ends.tolist() == [0, 1, 1]
+
+
+def test_parts_of_groups() -> None:
+    first, starts = np.array([2, 5, 9]), np.array([0, 3, 3, 70])
+    x = torch.randn(80, 5, generator=torch.Generator().manual_seed(6))
+    chosen = torch.tensor([2, 3, 4, *range(9, 76)])
+    assert_like_reference(
+        lambda x: part_rows(x, first, starts), lambda x: x.index_select(0, chosen), [x]
+    )
+    assert torch.equal(part_rows(x[:, 0], first, starts), x[chosen, 0])
+    assert torch.equal(part_rows(x.double(), first, starts), x.double()[chosen])
 
 
 def test_gradients_of_the_definitions() -> None:

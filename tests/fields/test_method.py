@@ -244,6 +244,16 @@ def test_what_is_hidden_is_not_evaluated_in_renders(
     assert share == 1 if shift < 0 else share < 0.5
 
 
+def test_rays_that_meet_nothing_show_the_background() -> None:
+    method, view = begun("clnerf", make_training_set(1)), make_training_set(1).views[0]
+    for grid in method.occupancy.grids:
+        grid[:] = 0
+    found = method.render(view, 0.0)
+    assert found.alpha is not None
+    assert not found.alpha.any()
+    assert np.array_equal(found.rgb, np.broadcast_to(method.background, found.rgb.shape))
+
+
 def test_a_photo_of_transient_things_alone_is_not_rendered() -> None:
     """Rendered views of NeRF-W have no transient density, whatever the head says."""
     method = begun("nerf-w", make_training_set(1))

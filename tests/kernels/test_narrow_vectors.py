@@ -22,6 +22,7 @@ LARGE_TESTS = (
     "rasterizer/test_agreement.py",
     "rasterizer/test_extremes.py",
     "anchors/test_decode.py",
+    "fields/test_kernels.py",
     "training/test_losses.py",
     "training/test_photometric.py",
     "training/optimizers/test_row_adam.py",

@@ -27,6 +27,7 @@ from chronoscene.harness.use.rendering import (
 )
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside
+from chronoscene.kernels.runtime import keep_freed_memory
 
 
 def parse_size(
@@ -128,6 +129,7 @@ def command(
     the middle of the sparse points, at the height and distance of the cameras unless others are
     given.
     """
+    keep_freed_memory()  # arrays as large as those of the picture before
     run = open_run(folder, device=device, plugin=plugin, stage=stage)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
     if is_animation(out):

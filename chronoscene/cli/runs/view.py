@@ -18,6 +18,7 @@ from chronoscene.harness.use.trained_run import open_run
 from chronoscene.harness.view.content import Content
 from chronoscene.harness.view.server import ANYWHERE, PORT, ViewServer, choose_port, tunnel_command
 from chronoscene.harness.view.summary import certificate_summary
+from chronoscene.kernels.runtime import keep_freed_memory
 
 
 @click.command("view")
@@ -47,6 +48,7 @@ def command(
     RUN is the folder of a run, such as runs/plaza/chronogs-joint-balanced/seed0; two or more runs
     of a scene are compared. SCENE is a dataset, or what register wrote. Ctrl-C ends the viewer.
     """
+    keep_freed_memory()  # arrays as large as those of the picture before
     chosen = choose_port(host, port)
     if any((folder / RUN_FILE).is_file() for folder in folders):
         runs = [open_run(folder, device=device, plugin=plugin) for folder in folders]

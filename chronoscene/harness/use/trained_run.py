@@ -276,9 +276,10 @@ class TrainedRun:
         if not hasattr(model, "to_gaussians"):
             raise ConfigError(
                 self.folder,
-                expected="a method that gives its Gaussians by to_gaussians",
-                found=self.spec.title,
-                todo="export a run of another method",
+                expected="a model made of Gaussians, as pages, exports and surveys need",
+                found=f"{self.spec.title}, which has none that it could give",
+                todo="choose a run of another method, such as chronogs; render and view show this "
+                "one",
             )
         scene = scene or self.scene()
         own = int(period) if self.strategy.model_per_period else None

@@ -116,7 +116,7 @@ def test_places_and_runs_that_are_refused(trained, runs, scene_folder, tmp_path)
     with pytest.raises(SceneError, match="a new or empty folder"):
         make_page([trained["chronogs"]], tmp_path / "used")
     mean = runs / "ring/mean-joint-balanced/seed0"
-    with pytest.raises(ConfigError, match="a method that gives its Gaussians"):
+    with pytest.raises(ConfigError, match="a model made of Gaussians"):
         make_page([mean], tmp_path / "page", "--plugin", "toy_methods:MEAN")
     shutil.rmtree(mean / "checkpoint")
     with pytest.raises(CheckpointError, match="expected a run with a model"):
