@@ -42,9 +42,7 @@ def test_a_model_and_photos_make_the_scene_again(distorted, tmp_path):
 def test_a_missing_photo_is_named(distorted, tmp_path):
     save_model(distorted, tmp_path / "place.npz")
     (distorted.images_root / "b/0.png").unlink()
-    with pytest.raises(
-        SceneError, match=r"b/0\.png: expected a photo of again, found no such"
-    ):
+    with pytest.raises(SceneError, match=r"b/0\.png: expected a photo of again, found no such"):
         make_scene(tmp_path / "place.npz", distorted.images_root, tmp_path / "again")
     assert not (tmp_path / "again").exists()
 
