@@ -142,7 +142,7 @@ def _composite_backward(  # type: ignore[no-untyped-def]
 
 
 class Front:
-    """What rays have gathered so far, from the camera on; nothing of it is differentiated.
+    """Sums along rays so far, from the camera on; nothing of it is differentiated.
 
     Samples that are added in several parts give the bits of `composite` with all of them.
 

@@ -49,7 +49,7 @@ def _corner(corner, cell, share, factors, dense, start, mask):  # type: ignore[n
 
 @inlined
 def _level(resolutions, starts, dense, level):  # type: ignore[no-untyped-def]
-    """What `_corner` needs to know of a level: factors of y and z, first row, mask of rows."""
+    """Numbers of a level that `_corner` reads: factors of y and z, first row, mask of rows."""
     points = int32(resolutions[level] + 1)
     y = points if dense[level] else int32(PRIMES[0])
     z = int32(points * points) if dense[level] else int32(PRIMES[1])

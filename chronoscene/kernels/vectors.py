@@ -61,17 +61,21 @@ def emitted(signature: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any
 
 
 def _features() -> list[str]:
-    """What the processor has. Honours NUMBA_CPU_FEATURES, as compiled code does."""
+    """List what the processor has. Honours NUMBA_CPU_FEATURES, as compiled code does."""
     features = config.CPU_FEATURES  # type: ignore[attr-defined]
     if features is None:
         features = binding.get_host_cpu_features().flatten()
     return str(features).split(",")
 
 
-_NAMES = _features()
-LANES = 16 if "+avx512f" in _NAMES else 8 if "+avx2" in _NAMES else 4
-"""Numbers of 32 bits in the widest register of the processor: AVX-512, AVX2, or others."""
-BYTE_PRODUCTS = LANES == 16 and "+avx512vnni" in _NAMES
+def _register_lanes() -> int:
+    """16 with AVX-512, 8 with AVX2, else 4."""
+    names = _features()
+    return 16 if "+avx512f" in names else 8 if "+avx2" in names else 4
+
+
+LANES = _register_lanes()  # Numbers of 32 bits in the widest register of the processor
+BYTE_PRODUCTS = LANES == 16 and "+avx512vnni" in _features()
 """True if the processor has `emit_add_byte_products`."""
 MANY_REGISTERS = LANES == 16 or platform.machine() in ("aarch64", "arm64")
 """32 vector registers, else 16."""

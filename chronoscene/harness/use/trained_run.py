@@ -277,7 +277,7 @@ class TrainedRun:
             raise ConfigError(
                 self.folder,
                 expected="a model made of Gaussians, as pages, exports and surveys need",
-                found=f"{self.spec.title}, which has none that it could give",
+                found=self.spec.title,
                 todo="choose a run of another method, such as chronogs; render and view show this "
                 "one",
             )

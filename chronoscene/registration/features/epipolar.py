@@ -29,8 +29,8 @@ CERTAIN = 20
 """Matches that must agree: a wrong geometry finds 15 to 18 that do, and hides a right one."""
 
 MANY, CLEAR = 45, 1 / 3
-"""Where fewer agree than this share of so many matches, the samples may have missed a geometry that
-COLMAP would find: it needs samples of only five matches where focal lengths are known."""
+"""Number of matches, and the share that must agree: with fewer, samples may have missed a geometry
+that COLMAP would find, as it needs samples of only five matches where focal lengths are known."""
 
 
 def plausible_matches(first: Placed, second: Placed) -> NDArray[np.uint32]:

@@ -29,7 +29,7 @@ class Excess:
     low: float
     """Lower bound, from the spread over the images."""
     noise: float
-    """What noise explains, by the median."""
+    """Share that noise explains, by the median."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,7 +59,7 @@ def test_budget_and_width_are_options(make_scene_folder, tmp_path, monkeypatch):
 def test_mistakes_are_one_line(make_scene_folder, tmp_path):
     scene, file = make_scene_folder(IMAGES, name="place"), tmp_path / "rates.toml"
     file.write_text(STUDY.replace("label", "name"))
-    shipped = "base-length, cl-splats-released, comp"
+    shipped = "base-length, cl-splats-released, clnerf-released, comp"
     for name, text in ((file, "Field required (rows.0.label)"), ("parts", shipped)):
         done = chronoscene("study", name, scene, "--out", tmp_path / "runs")
         assert done.exit_code == 2 and done.stderr.count("\n") == 1

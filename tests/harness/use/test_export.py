@@ -192,7 +192,7 @@ def test_the_columns_are_those_of_3dgs(trained, tmp_path):
 
 def test_what_cannot_be_exported(runs, trained, scene_folder, tmp_path):
     toy = ("--plugin", "toy_methods:MEAN")
-    with pytest.raises(ConfigError, match=r"expected a method that gives.*found Mean"):
+    with pytest.raises(ConfigError, match=r"expected a model made of Gaussians.*found Mean"):
         export(runs / "ring/mean-joint-balanced/seed0", tmp_path / "a.ply", 0, *toy)
     with pytest.raises(ConfigError, match=r"period 0\.5: expected a whole number: 4DGS"):
         export(trained["4dgs"], tmp_path / "a.ply", 0.5)
