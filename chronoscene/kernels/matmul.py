@@ -125,5 +125,5 @@ relu_product = _make_product(relu=True)
 pair_product = _make_product(emit_add_pair_products)
 """Matrix product of int32 matrices, each number a pair of int16: sums of the products of both."""
 byte_product = _make_product(emit_add_byte_products)
-"""Matrix product as of pairs, of numbers of four bytes each, of the left without and of the right with
-a sign; only where there are `BYTE_PRODUCTS`."""
+"""Matrix product as of pairs, of numbers of four bytes each, of the left without and of the right
+with a sign; only where there are `BYTE_PRODUCTS`."""
