@@ -17,7 +17,7 @@ from chronoscene.formats import chronoscene as our_format
 from chronoscene.io.staging import replacing
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.scene.cameras import project_points
-from chronoscene.scene.tracks import by_image
+from chronoscene.scene.tracks import by_image, track_owners
 from chronoscene.undistort import undistort
 
 MODELS = Path(__file__).with_name("models")
@@ -82,7 +82,7 @@ def _with_photos(path: Path, photos: Path, name: str) -> Scene:
                 todo="correct --photos",
             )
     start = np.concatenate([[0], np.cumsum(seen_by.astype(np.int64))])
-    owner = np.repeat(np.arange(len(xyz)), np.diff(start))
+    owner = track_owners(start)
     pixels = np.empty((len(track_frame), 2))
     for frame, rows in zip(frames, by_image(track_frame, len(frames)), strict=True):
         rotation, shift = frame.cam_from_world[:3, :3], frame.cam_from_world[:3, 3]

@@ -27,12 +27,14 @@ from PIL import Image
 
 import chronoscene as cs
 from chronoscene.edit import Edits, edit
+from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
-from chronoscene.images.truth import truth_place
+from chronoscene.images.truth import load_depth
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.scene.tracks import track_owners
 
 Mask = NDArray[np.bool_]
 
@@ -47,7 +49,7 @@ def cut_of(scene: Scene) -> tuple[int, float]:
 def photos_of_block(scene: Scene, inside: Mask, share: float) -> tuple[str, ...]:
     """Names of the photos with at least so large a share of their observations inside."""
     points, frames = scene.points, len(scene.frames)
-    counted = np.repeat(inside, np.diff(points.track_start))
+    counted = inside[track_owners(points.track_start)]
     all_of = np.bincount(points.track_frame, minlength=frames)
     some = np.bincount(points.track_frame[counted], minlength=frames)
     kept = some >= np.maximum(1, share * all_of)
@@ -66,7 +68,9 @@ def joined(runs: Sequence[TrainedRun], period: int, axis: int, cut: float) -> Ga
 
 def near_the_cut(scene: Scene, frame: Frame, axis: int, cut: float, band: float) -> Mask:
     """Pixels whose surface is within ``band`` world units of the cut. [H, W]"""
-    depth = np.load(scene.root / "gt" / truth_place("depth", frame.name))["depth"]
+    depth = load_depth(scene.root / "gt", frame.name, None)
+    if depth is None:
+        raise SystemExit(f"{frame.name}: expected depth in {scene.root / 'gt'}, found none")
     rows, columns = np.indices(depth.shape) + 0.5
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(frame.camera.K).T
     world_from_cam = np.linalg.inv(frame.cam_from_world)
@@ -80,7 +84,7 @@ def render(run: TrainedRun, cloud: GaussianCloud, scene: Scene, frame: Frame) ->
     shown = run.model(frame.period).render_gaussians(
         cloud.transformed(run.training_from_world), view
     )
-    return np.asarray(np.clip(shown.rgb * 255 + 0.5, 0, 255), np.uint8)
+    return to_bytes(shown.rgb)
 
 
 def main() -> None:

@@ -50,7 +50,7 @@ def test_otherwise_the_caller_does_it(
 
 
 def test_each_thread_has_helpers_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two calls on four threads, each runs kernels on two, at the same time."""
+    """Two calls on four threads run kernels on two each, at the same time."""
     if available_threads() < 2:
         pytest.skip("one processor only")
     monkeypatch.setattr(module, "_may_share", lambda: True)

@@ -93,8 +93,12 @@ def load_sift(opened: pycolmap.Database, image_id: int) -> Descriptors:
 
 def load_placed(opened: pycolmap.Database, image_id: int) -> Placed:
     """Read SIFT descriptors and the pixels of their keypoints."""
-    keypoints = np.asarray(opened.read_keypoints(image_id), np.float64)[:, :2]
-    return load_sift(opened, image_id), np.ascontiguousarray(keypoints)
+    return load_sift(opened, image_id), _pixels(opened, image_id)
+
+
+def _pixels(opened: pycolmap.Database, image_id: int) -> NDArray[np.float64]:
+    """Read the pixels of keypoints. [N, 2]"""
+    return np.ascontiguousarray(opened.read_keypoints(image_id)[:, :2], np.float64)
 
 
 def store_matches(
@@ -127,9 +131,7 @@ def _verify(database: str, pairs: Sequence[tuple[str, str]], threads: int) -> No
         ]
         ids = [(int(first.image_id), int(second.image_id)) for first, second in ordered]
         used = sorted({i for pair in ids for i in pair})
-        points = {
-            i: np.ascontiguousarray(opened.read_keypoints(i)[:, :2], np.float64) for i in used
-        }
+        points = {i: _pixels(opened, i) for i in used}
         sides = [
             [(cameras[image.camera_id], points[int(image.image_id)]) for image in pair]
             for pair in ordered
