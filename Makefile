@@ -24,7 +24,7 @@ SCENE := $(DEMO)/demo
 DEMO_METHODS := chronogs,scaffold-gs,3dgs,4dgs
 DEMO_BUDGET := 90s
 
-.PHONY: demo leaderboard test lint mutants clean distclean open3d-libraries
+.PHONY: demo leaderboard test lint mutants clean distclean
 
 demo: $(DEMO)/.made
 	$(BIN)/chronoscene validate $(SCENE)
@@ -72,22 +72,8 @@ $(READY): pyproject.toml constraints.txt
 		|| $(PIP) "$(TORCH)" --index-url $(TORCH_CPU_INDEX) 2>/dev/null \
 		|| $(PIP) "$(TORCH)"
 	$(PIP) --constraint constraints.txt --editable '.[dev]'
-	@$(PIP) --constraint constraints.txt --editable '.[synth]' 2>/dev/null \
-		&& $(MAKE) --no-print-directory open3d-libraries \
-		|| echo "open3d cannot be had here: chronoscene synth and its tests need it" >&2
 	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # Some packages have templates
 	touch $@
-
-# The wheel of open3d leaves out a few libraries of the system, libusb first of all. Nothing but
-# chronoscene synth needs it, which says so itself where it does not load.
-OPEN3D_PACKAGES := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
-
-open3d-libraries:
-	@if $(BIN)/python -c 'import open3d' 2>/dev/null || ! command -v apt-get >/dev/null; then exit 0; fi; \
-	if [ "$$(id -u)" = 0 ]; then sudo=; elif sudo -n true 2>/dev/null; then sudo=sudo; else exit 0; fi; \
-	$$sudo apt-get -qq install -y $(OPEN3D_PACKAGES) >/dev/null 2>&1 \
-		|| { $$sudo apt-get -qq update && $$sudo apt-get -qq install -y $(OPEN3D_PACKAGES); } \
-		>/dev/null || true
 
 clean:
 	rm -rf $(DEMO) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -97,8 +97,8 @@ def make(folder: Path, fixed: FixedScene, photos: Path | None = None) -> None:
             folder,
             expected=f"scene {fixed.scene_hash[:10]}, split {fixed.split_hash[:10]}",
             found=f"scene {found[0][:10]}, split {found[1][:10]}",
-            todo="make it again in another folder; if it differs again, this version of open3d or "
-            "this platform draws other pixels: do not compare its results with those of the table",
+            todo="make it again in another folder; if it differs again, this platform or a library "
+            "draws other pixels: do not compare its results with those of the table",
         )
 
 

@@ -130,19 +130,6 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(
-    item: pytest.Item,
-) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """A test that generates a scene is skipped where open3d, an optional package, is missing."""
-    report = yield
-    found = str(report.longrepr)
-    if report.failed and "open3d: expected the package" in found:
-        report.outcome = "skipped"
-        report.longrepr = (str(item.path), 0, "Skipped: open3d is missing, or does not load")
-    return report
-
-
 @pytest.fixture
 def set_gsplat(monkeypatch: pytest.MonkeyPatch) -> Generator[Callable[[str | None], None]]:
     """Pretends that a version of gsplat is installed, or none."""

@@ -68,7 +68,6 @@ def command() -> None:
         ),
         _cuda(),
         _gsplat(),
-        _open3d(),
         _lpips(),
         _video(),
         _extras(),
@@ -141,18 +140,6 @@ def _gsplat() -> Diagnosis:
         found = f"{error.found}, not {error.expected}"
         return Diagnosis("gsplat", "missing", found, f"{error.todo}; --device cuda needs it")
     return Diagnosis("gsplat", "ok", f"gsplat {version('gsplat')}")
-
-
-def _open3d() -> Diagnosis:
-    try:
-        from chronoscene.synth.render.renderer import load_open3d
-
-        return Diagnosis("open3d", "ok", f"open3d {load_open3d().__version__}")
-    except ImportError as error:  # of what synth needs besides
-        return Diagnosis("open3d", "missing", str(error))
-    except ChronoSceneError as error:
-        todo = f"{error.todo}; chronoscene synth needs it"
-        return Diagnosis("open3d", "missing", error.found, todo)
 
 
 def _lpips() -> Diagnosis:

@@ -169,7 +169,7 @@ def _free_pose(
         aim = target + (shift if kind == "street" else 0)
         pose = look_at(place, aim, float(rng.normal(0, 0.015)))
         if all(
-            r.clearance(place[None])[0] >= apart * 0.6
+            r.surfaces.nearest(place[None])[0][0] >= apart * 0.6
             and r.coarse_depth(camera, pose).min() >= apart
             for r in renderers
         ):

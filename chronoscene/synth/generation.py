@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
@@ -16,7 +15,7 @@ from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.synth.city.plan import make_world
 from chronoscene.synth.city.world import World
 from chronoscene.synth.flights import plan_frames
-from chronoscene.synth.render.renderer import PeriodRenderer, load_open3d
+from chronoscene.synth.render.renderer import PeriodRenderer
 from chronoscene.synth.settings import SynthSettings
 from chronoscene.synth.sparse_points import make_points
 from chronoscene.synth.truth import save_image, write_truth
@@ -31,10 +30,7 @@ def run(out: Path, settings: SynthSettings, progress: Progress | None = None) ->
     """Generate a scene; see `chronoscene.synth.generate`. Either all of it appears or nothing."""
     progress = progress or (lambda done, total, what: None)
     progress(0, 1, "city")
-    load_open3d()
-    with warnings.catch_warnings(), staged_folder(out) as staged:
-        # open3d loads a TBB that is too old for Numba, which warns and uses another layer.
-        warnings.filterwarnings("ignore", message="The TBB threading layer")
+    with staged_folder(out) as staged:
         raw = staged.parent / "raw"
         scene = _make(raw, settings, progress, out.name)
         scene_format.write(scene, staged, image_source="link")

@@ -87,7 +87,7 @@ def _candidates(
     local = np.column_stack([xy, np.ones(count)]) @ np.linalg.inv(frame.camera.K).T
     world_from_cam = np.linalg.inv(frame.cam_from_world)
     rays = _rays(world_from_cam[:3, 3], local @ world_from_cam[:3, :3].T)
-    hits = renderer.cast(rays)
+    hits = renderer.surfaces.cast(rays)
     good = (hits.tri != MISS) & (hits.t < MAX_DEPTH)
     xyz = rays[:, :3].astype(np.float64) + hits.t[:, None].astype(np.float64) * rays[:, 3:]
     albedo = renderer.albedo(rays, hits, np.zeros(count))
@@ -120,7 +120,9 @@ def _visibility(
         # A point is seen if the ray to it ends there, on the same object.
         renderer, depth = renderers[frame.period], local[rows, 2]
         centre = np.linalg.inv(frame.cam_from_world)[:3, 3]
-        hits = renderer.cast(_rays(centre, (candidates.xyz[rows] - centre) / depth[:, None]))
+        hits = renderer.surfaces.cast(
+            _rays(centre, (candidates.xyz[rows] - centre) / depth[:, None])
+        )
         close = np.abs(hits.t - depth) < 1e-4 * depth + 1e-3
         seen[rows, column] = close & (renderer.elements_of(hits.tri) == candidates.element[rows])
     return seen, xy

@@ -10,7 +10,6 @@ from click.testing import CliRunner
 
 from chronoscene import __version__
 from chronoscene.cli import cli, doctor
-from chronoscene.synth.render.renderer import load_open3d
 
 
 def run():
@@ -33,10 +32,7 @@ def bare(monkeypatch, tmp_path, set_gsplat):
     monkeypatch.setattr("chronoscene.metrics.lpips_weights.find_spec", lambda name: None)
     monkeypatch.setattr(doctor, "find_spec", lambda name: None)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    load_open3d.cache_clear()
-    yield tmp_path
-    load_open3d.cache_clear()
+    return tmp_path
 
 
 def test_bare_machine_trains_and_is_told_what_to_install(bare):
@@ -47,7 +43,6 @@ def test_bare_machine_trains_and_is_told_what_to_install(bare):
     assert {part for part, (state, _) in found.items() if state == "missing"} == {
         "CUDA",
         "gsplat",
-        "open3d",
         "LPIPS weights",
         "video",
         "extras",
@@ -57,7 +52,6 @@ def test_bare_machine_trains_and_is_told_what_to_install(bare):
     for advice in (
         "CUDA: not needed: methods are trained on the CPU",
         "gsplat: pip install 'chronoscene[cuda]', or use the CPU",
-        "open3d: pip install 'chronoscene[synth]'",
         "LPIPS weights: run chronoscene download lpips-weights",
         "extras: pip install 'chronoscene[compress,flip,hloc,ray,survey,tune,view]'",
     ):
@@ -66,7 +60,7 @@ def test_bare_machine_trains_and_is_told_what_to_install(bare):
 
 def test_every_extra_has_a_row():
     known = metadata("chronoscene").get_all("Provides-Extra")
-    assert {*doctor.EXTRAS, "cuda", "dev", "lpips", "synth"} == set(known)
+    assert {*doctor.EXTRAS, "cuda", "dev", "lpips"} == set(known)
 
 
 def test_full_machine(bare, monkeypatch, set_gsplat):
@@ -97,7 +91,7 @@ def test_a_gsplat_of_another_version_is_not_ok(bare, set_gsplat):
 )
 def test_works_without_what_training_needs(modules):
     code = (
-        f"import sys; sys.modules.update(dict.fromkeys({[*modules, 'open3d']}))\n"
+        f"import sys; sys.modules.update(dict.fromkeys({[*modules]}))\n"
         "sys.argv = ['chronoscene', 'doctor']\n"
         "from chronoscene.cli import main; main()"
     )

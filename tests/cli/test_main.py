@@ -120,7 +120,7 @@ def test_help_imports_nothing_heavy():
         "import sys; from chronoscene.cli import cli\n"
         "try: cli.main(['--version'])\n"
         "except SystemExit: pass\n"
-        "heavy = {'torch', 'numba', 'open3d', 'cv2', 'pandas', 'pycolmap'} & set(sys.modules)\n"
+        "heavy = {'torch', 'numba', 'cv2', 'pandas', 'pycolmap'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -45,7 +45,6 @@ def test_roles_are_told_by_hash():
 @pytest.fixture
 def table(monkeypatch, tmp_path) -> dict[str, FixedScene]:
     """A table of one tiny scene, made once, and one that is made by hand."""
-    pytest.importorskip("open3d")
     settings = asdict(preset("tiny", views=4, points=100, seed=5))
     tiny = FixedScene("tuning", "tiny", "0" * 64, "0" * 64, "0" * 64, synth=settings)
     with pytest.raises(SceneError, match="expected scene 0000000000, split 0000000000, found"):
@@ -78,5 +77,4 @@ def test_scenes_are_made_again_checked_and_told_apart(table, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_ranking_scene_is_the_one_of_the_table(tmp_path):
-    pytest.importorskip("open3d")
     make(tmp_path / "ranking-street", TABLE["ranking-street"])

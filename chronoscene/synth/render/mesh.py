@@ -252,7 +252,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-MISS = 0xFFFFFFFF  # Primitive id that the ray caster gives to rays that hit nothing
+MISS = 0xFFFFFFFF  # Triangle of a ray that hits nothing
 
 
 @inner

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
-from typing import Any, NamedTuple
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.arrays import Array
-from chronoscene.errors import BackendError
 from chronoscene.scene import Camera
 from chronoscene.synth.render.light import Light, Probes, probe_values, sky_args
 from chronoscene.synth.render.mesh import MISS, Mesh
+from chronoscene.synth.render.ray_caster import Hits, RayCaster
 from chronoscene.synth.render.shade import albedo_at, camera_rays, shade, shadow_rays
 
 MAX_SAMPLES = 1_500_000  # Maximum number of rays in memory at once
@@ -34,18 +33,8 @@ class PixelMaps:
     """Linear. [H, W, 3]"""
 
 
-class Hits(NamedTuple):
-    """First hits of rays."""
-
-    t: NDArray[np.float32]
-    """Parameter along the ray; infinite for a miss. [n]"""
-    tri: NDArray[np.uint32]
-    uv: NDArray[np.float32]
-    """Barycentric coordinates. [n, 2]"""
-
-
 class PeriodRenderer:
-    """Ray caster and shader of the world at one period.
+    """Shader of the world at one period.
 
     Args:
         mesh: All geometry of the period.
@@ -72,31 +61,14 @@ class PeriodRenderer:
         self._ss = supersample
         self._box, self._spacing = probe_box, probe_spacing
         self.tables = mesh
-        self._scene = load_open3d().t.geometry.RaycastingScene()
-        corners = np.ascontiguousarray(mesh.vertices.reshape(-1, 3))
-        index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-        self._scene.add_triangles(_tensor(corners), _tensor(index))
-
-    def cast(self, rays: NDArray[np.float32]) -> Hits:
-        """First hits of rays (origin, direction). [n, 6]"""
-        found = self._scene.cast_rays(_tensor(rays))
-        return Hits(*(found[k].numpy() for k in ("t_hit", "primitive_ids", "primitive_uvs")))
-
-    def occluded(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Mask of the rays that hit anything. [n]"""
-        return np.asarray(self._scene.test_occlusions(_tensor(rays)).numpy(), np.bool_)
-
-    def clearance(self, points: Array) -> Array:
-        """Distance from points [n, 3] to the nearest surface. [n]"""
-        query = _tensor(np.asarray(points, np.float32))
-        return np.asarray(self._scene.compute_distance(query).numpy(), np.float64)
+        self.surfaces = RayCaster(mesh.vertices)
 
     def coarse_depth(self, camera: Camera, cam_from_world: Array) -> NDArray[np.float32]:
         """z-depth on a 24 x 18 grid over the view; infinite for the sky. [n]"""
         k = camera.K.copy()
         k[0] *= 24 / camera.width
         k[1] *= 18 / camera.height
-        return self.cast(camera_rays(np.linalg.inv(cam_from_world), k, 24, 0, 18, 1)).t
+        return self.surfaces.cast(camera_rays(np.linalg.inv(cam_from_world), k, 24, 0, 18, 1)).t
 
     def image(self, camera: Camera, cam_from_world: Array) -> NDArray[np.uint8]:
         """Photo of the period. [H, W, 3]"""
@@ -115,7 +87,7 @@ class PeriodRenderer:
         shape = (camera.height, camera.width)
         world_from_cam = np.linalg.inv(cam_from_world)
         rays = camera_rays(world_from_cam, camera.K, camera.width, 0, camera.height, 1)
-        hits = self.cast(rays)
+        hits = self.surfaces.cast(rays)
         depth = np.where(hits.tri == MISS, np.float32(0), hits.t)
         color = self.albedo(rays, hits, depth / camera.K[0, 0])
         element = self.elements_of(hits.tri).reshape(shape)
@@ -123,12 +95,10 @@ class PeriodRenderer:
 
     def surface_near(self, points: Array) -> NDArray[np.uint32]:
         """Triangles that pass through points, `MISS` where the nearest is too far away. [n]"""
-        query = _tensor(np.asarray(points, np.float32))
-        found = self._scene.compute_closest_points(query)
-        gap = np.linalg.norm(found["points"].numpy() - points, axis=1)
+        gap, tri = self.surfaces.nearest(points)
         # A millimetre, and the rounding of single precision far from the origin.
         limit = 1e-3 + 2e-6 * np.abs(points).max(axis=1)
-        return np.where(gap < limit, found["primitive_ids"].numpy(), np.uint32(MISS))
+        return np.where(gap < limit, tri, np.uint32(MISS))
 
     def elements_of(self, tri: NDArray[np.uint32]) -> NDArray[np.int32]:
         """Identity of the objects of triangles, -1 for `MISS`. [n]"""
@@ -175,7 +145,7 @@ class PeriodRenderer:
     def _probe_batch(
         self, rays: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        hits = self.cast(rays)
+        hits = self.surfaces.cast(rays)
         lit = self._lit(rays, hits, 1)
         means = _mean_albedo(self.tables.styles)
         return probe_values(rays, *hits, lit, self.tables, means, self._sky, PROBE_RAYS)
@@ -186,40 +156,15 @@ class PeriodRenderer:
             rays, *hits, self.tables, self._sky.direction, SUN_SPREAD, count
         )
         lit = np.zeros(len(need), np.bool_)
-        lit[need] = ~self.occluded(np.ascontiguousarray(towards[need]))
+        lit[need] = ~self.surfaces.occluded(towards[need])
         return lit
 
     def _shade(
         self, rays: NDArray[np.float32], per_pixel: int, fw_unit: float
     ) -> NDArray[np.uint8]:
-        hits = self.cast(rays)
+        hits = self.surfaces.cast(rays)
         lit = self._lit(rays, hits, per_pixel)
         return shade(rays, *hits, lit, self.tables, self._sky, self.probes, per_pixel, fw_unit)
-
-
-@cache
-def load_open3d() -> Any:
-    """Import open3d, which only this ray caster needs.
-
-    Raises:
-        BackendError: If it is not installed or system libraries are missing.
-    """
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise BackendError(
-            "open3d",
-            expected="the package that casts rays for generated scenes",
-            found=str(error).splitlines()[0],
-            todo="pip install 'chronoscene[synth]', and on Debian or Ubuntu also apt-get install "
-            "libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6",
-        ) from error
-    return open3d
-
-
-def _tensor(array: Any) -> Any:
-    """An array as an open3d tensor."""
-    return load_open3d().core.Tensor(np.ascontiguousarray(array))
 
 
 def _sphere(count: int) -> NDArray[np.float32]:

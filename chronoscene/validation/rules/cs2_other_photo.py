@@ -69,11 +69,22 @@ def image_other_photo(scene: RawScene, pixels: dict[str, Pixels]) -> Iterator[Hi
     periods = scene.periods or {}
     values = grouped((periods.get(name, -1), value) for name, (value, _) in fits.items())
     for name, sight in wrong.items():
-        period = periods.get(name, -1)
-        if period not in whole and fits[name][0] < OF_USUAL * np.nanmedian(values[period]):
-            right, also = _what_fits(sight, name, suspects)
-            found = f"colours that do not fit (correlation {fits[name][0]:.2f}{right})"
+        period, value = periods.get(name, -1), fits[name][0]
+        if period in whole or value >= OF_USUAL * np.nanmedian(values[period]):
+            continue
+        right, also = _what_fits(sight, name, suspects)
+        if right or value + _chance(value, len(sight.brightness)) < MIN_CORRELATION:
+            found = f"colours that do not fit (correlation {value:.2f}{right})"
             yield Hit(f"images/{name}", "a photo of the points that it sees", found, also=also)
+
+
+def _chance(correlation: float, count: int) -> float:
+    """Amount by which a correlation of ``count`` pairs may be too low by chance (one-sided 95 %).
+
+    Source: Fisher, "On the probable error of a coefficient of correlation", 1921.
+    """
+    z = np.arctanh(np.clip(correlation, -0.999, 0.999)) + 1.645 / np.sqrt(count - 3)
+    return float(np.tanh(z) - correlation)
 
 
 def _exchanged(fits: Mapping[str, tuple[float, Sight]], greys: Greys) -> Iterator[Hit]:

@@ -103,7 +103,7 @@ def test_cameras_keep_their_distance(made, renderers) -> None:  # type: ignore[n
     for frame in made.scene.frames:
         eye = np.linalg.inv(frame.cam_from_world)[:3, 3]
         for renderer in renderers:
-            assert renderer.clearance(eye[None])[0] >= 3.5
+            assert renderer.surfaces.nearest(eye[None])[0] >= 3.5
             depth = renderer.maps(frame.camera, frame.cam_from_world).depth
             assert depth[depth > 0].min() > 4.0
 
@@ -124,7 +124,7 @@ def test_street_views_walk_between_the_houses() -> None:
     assert (np.abs(forward[:, 2]) < 0.35).all(), "street cameras look along the ground"
     # No facade may be closer than the walk allows, in any period.
     for renderer in renderers:
-        assert (renderer.clearance(eyes) > 0.7).all()
+        assert (renderer.surfaces.nearest(eyes)[0] > 0.7).all()
 
 
 def test_rebuilt_blocks_leave_the_streets() -> None:
