@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import filecmp
 import os
+import platform
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,8 @@ import numpy as np
 import pytest
 
 from chronoscene.errors import SceneError
+from chronoscene.formats import chronoscene as scene_format
+from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.synth import generate, preset
 from chronoscene.validation.run import validate_scene
 
@@ -43,6 +48,30 @@ def test_same_seed_same_bytes_with_one_thread(small: Path, tmp_path: Path) -> No
     assert names == files(tmp_path / "one")
     same, different, failed = filecmp.cmpfiles(small, tmp_path / "one", names, shallow=False)
     assert not different and not failed and len(same) == len(names)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="names a processor of x86-64")
+def test_same_seed_same_hash_on_an_old_processor(small: Path, tmp_path: Path) -> None:
+    """Our code, numpy's linear algebra and the library of the system without AVX and FMA.
+
+    Poses have other last bits then, which the hash rounds.
+    """
+    old = {
+        "NUMBA_CPU_NAME": "x86-64",
+        "NUMBA_CPU_FEATURES": "",
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "OPENBLAS_CORETYPE": "Prescott",
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX,-AVX2,-FMA,-AVX512F",
+    }
+    script = (
+        "import sys; from chronoscene.synth import generate, preset\n"
+        f"generate(sys.argv[1], preset('tiny', **{SMALL}))"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "old")]
+    subprocess.run(command, env={**os.environ, **old}, check=True)
+    hashes = {scene_hash(scene_format.read(folder)) for folder in (small, tmp_path / "old")}
+    assert len(hashes) == 1
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ from chronoscene.synth.render.mesh import MISS
 from chronoscene.synth.render.noise import dot
 
 WIDTH = 8  # Boxes of a node
-_LEAF = 4  # Triangles of a box that is not divided
+_LEAF = 2  # Triangles of a box that is not divided
 _BINS = 16
 _STACK = 512  # Open nodes: seven of each level, and no tree has more than 70 levels
 _AT_A_TIME = 1024  # Rays or points of a task
