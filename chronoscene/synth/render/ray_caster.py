@@ -63,8 +63,8 @@ class _Tree(NamedTuple):
     """Lowest x, y, z of the boxes of each node, then the highest. [nodes * 6 * WIDTH]"""
     first: NDArray[np.int32]
     """Node in a box, or the first of its triangles. [nodes * WIDTH]"""
-    count: NDArray[np.int32]
-    """Triangles in a box; 0 if it has a node. [nodes * WIDTH]"""
+    triangles: NDArray[np.int32]
+    """Number of triangles in a box; 0 if it has a node. [nodes * WIDTH]"""
     corners: NDArray[np.float32]
     """Triangles in the order of the boxes. [T, 3, 3]"""
     number: NDArray[np.uint32]
@@ -101,26 +101,26 @@ class RayCaster:
 
 
 @inner
-def _half_area(box):  # type: ignore[no-untyped-def]
+def _half_area(box):
     x, y, z = box[3] - box[0], box[4] - box[1], box[5] - box[2]
     return x * y + y * z + z * x
 
 
 @inner
-def _enclose(box, low, high):  # type: ignore[no-untyped-def]
+def _enclose(box, low, high):
     for axis in range(3):
         box[axis] = min(box[axis], low[axis])
         box[3 + axis] = max(box[3 + axis], high[axis])
 
 
 @inner
-def _clear(boxes):  # type: ignore[no-untyped-def]
+def _clear(boxes):
     boxes[..., :3] = np.inf
     boxes[..., 3:] = -np.inf
 
 
 @inner
-def _partition(order, start, end, bins, last):  # type: ignore[no-untyped-def]
+def _partition(order, start, end, bins, last):
     """Move the triangles of the bins up to ``last`` to the front; return where the rest begins."""
     i, j = start, end
     while i < j:
@@ -134,7 +134,7 @@ def _partition(order, start, end, bins, last):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _divide(low, high, order, start, end, bins, bin_boxes, bin_counts, right):  # type: ignore[no-untyped-def]
+def _divide(low, high, order, start, end, bins, bin_boxes, bin_counts, right):
     """Divide triangles start..end of the order in two; return where the second part begins."""
     centres = np.empty(6)
     _clear(centres)
@@ -143,7 +143,7 @@ def _divide(low, high, order, start, end, bins, bin_boxes, bin_counts, right):  
             c = low[order[i], axis] + high[order[i], axis]
             centres[axis] = min(centres[axis], c)
             centres[3 + axis] = max(centres[3 + axis], c)
-    axis = np.argmax(centres[3:] - centres[:3])
+    axis = int(np.argmax(centres[3:] - centres[:3]))
     origin, extent = centres[axis], centres[3 + axis] - centres[axis]
     if extent <= 0.0:
         return (start + end) // 2
@@ -176,15 +176,15 @@ def _divide(low, high, order, start, end, bins, bin_boxes, bin_counts, right):  
 
 
 @inner
-def _bounds(low, high, order, start, end, box):  # type: ignore[no-untyped-def]
+def _bounds(low, high, order, start, end, box):
     _clear(box)
     for i in range(start, end):
         _enclose(box, low[order[i]], high[order[i]])
 
 
 @kernel
-def _build(low, high):  # type: ignore[no-untyped-def]
-    """The tree over the boxes of triangles: boxes, first and count of `_Tree`, and the order."""
+def _build(low, high):
+    """The tree over the boxes of triangles: boxes, first and triangles of `_Tree`; the order."""
     order = np.arange(len(low)).astype(np.int32)
     bins = np.empty(len(low), np.int8)
     bin_boxes, bin_counts, right = np.empty((_BINS, 6)), np.empty(_BINS, np.int64), np.empty(_BINS)
@@ -237,7 +237,7 @@ def _build(low, high):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _inverse(d):  # type: ignore[no-untyped-def]
+def _inverse(d):
     """1 / d in single precision, finite where d is 0."""
     if abs(d) < 1e-18:
         return np.float32(1e18 if d >= 0.0 else -1e18)
@@ -245,7 +245,7 @@ def _inverse(d):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _hit_boxes(boxes, node, origin, inverse, near_planes, limit, distances):  # type: ignore[no-untyped-def]
+def _hit_boxes(boxes, node, origin, inverse, near_planes, limit, distances):
     """Mark the boxes that a ray enters before a limit, a byte for each; write where it enters."""
     at, far_planes = node * (6 * WIDTH), 3 * WIDTH
     near = maximum(
@@ -273,7 +273,7 @@ def _hit_boxes(boxes, node, origin, inverse, near_planes, limit, distances):  # 
 
 
 @inlined
-def _near_boxes(boxes, node, point, limit, distances):  # type: ignore[no-untyped-def]
+def _near_boxes(boxes, node, point, limit, distances):
     """Mark the boxes nearer to a point than a limit, a byte for each; write squared distances."""
     at = node * (6 * WIDTH)
     square = _squared_gap(boxes, at, point[0])
@@ -285,14 +285,14 @@ def _near_boxes(boxes, node, point, limit, distances):  # type: ignore[no-untype
 
 
 @inlined
-def _squared_gap(boxes, at, x):  # type: ignore[no-untyped-def]
+def _squared_gap(boxes, at, x):
     low, high = _load(boxes, at) - x, x - _load(boxes, at + 3 * WIDTH)
     gap = maximum(maximum(low, high), np.float32(0))
     return gap * gap
 
 
 @inner
-def _push(marked, node, distances, stack, open_at, top):  # type: ignore[no-untyped-def]
+def _push(marked, node, distances, stack, open_at, top):
     """Put marked boxes of a node on the stack, the nearest last; return the new height."""
     base = top
     while marked != 0:
@@ -309,17 +309,17 @@ def _push(marked, node, distances, stack, open_at, top):  # type: ignore[no-unty
 
 
 @inner
-def _cross(a, b):  # type: ignore[no-untyped-def]
+def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @inner
-def _minus(a, b):  # type: ignore[no-untyped-def]
+def _minus(a, b):
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @inner
-def _corner(corners, tri, k):  # type: ignore[no-untyped-def]
+def _corner(corners, tri, k):
     # Numba's float() would leave it in single precision.
     return (
         np.float64(corners[tri, k, 0]),
@@ -329,8 +329,8 @@ def _corner(corners, tri, k):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _hit(corners, tri, origin, d):  # type: ignore[no-untyped-def]
-    """Where a ray hits a triangle, infinity for nowhere, and barycentric coordinates.
+def _hit(corners, tri, origin, d):
+    """Parameter at which a ray hits a triangle, infinity for none, and barycentric coordinates.
 
     The volumes that the direction spans with two triangles' common edge differ only in their signs,
     so that no ray slips through between them.
@@ -359,13 +359,13 @@ def _hit(corners, tri, origin, d):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _between(a, b, c, x):  # type: ignore[no-untyped-def]
+def _between(a, b, c, x):
     low, high = min(a, b, c), max(a, b, c)
     return low - _ON_BOX * abs(low) <= x <= high + _ON_BOX * abs(high)
 
 
 @inner
-def _first_hit(tree, rays, i, guess, stack, open_at, distances, anything):  # type: ignore[no-untyped-def]
+def _first_hit(tree, rays, i, guess, stack, open_at, distances, anything):
     """First hit of a ray, or ``anything`` that it hits: t, place in the tree or -1, u, v.
 
     The triangle that the ray before has hit is a good ``guess``: it is tried first.
@@ -396,11 +396,11 @@ def _first_hit(tree, rays, i, guess, stack, open_at, distances, anything):  # ty
         if open_at[top] * (np.float32(1) - _MARGIN) > limit:
             continue
         inside = tree.first[box]
-        if tree.count[box] == 0:
+        if tree.triangles[box] == 0:
             marked = _hit_boxes(tree.boxes, inside, start, inverse, near_planes, limit, distances)
             top = _push(marked, inside, distances, stack, open_at, top)
             continue
-        for k in range(inside, inside + tree.count[box]):
+        for k in range(inside, inside + tree.triangles[box]):
             t, u, v = _hit(tree.corners, k, origin, d)
             if t < best or (t == best and place >= 0 and tree.number[k] < tree.number[place]):
                 best, place, best_u, best_v = t, k, u, v
@@ -411,7 +411,7 @@ def _first_hit(tree, rays, i, guess, stack, open_at, distances, anything):  # ty
 
 
 @kernel(parallel=True)
-def _cast(tree, rays):  # type: ignore[no-untyped-def]
+def _cast(tree, rays):
     n = len(rays)
     t, number = np.empty(n, np.float32), np.empty(n, np.uint32)
     uv = np.empty((n, 2), np.float32)
@@ -428,7 +428,7 @@ def _cast(tree, rays):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def _occluded(tree, rays):  # type: ignore[no-untyped-def]
+def _occluded(tree, rays):
     n = len(rays)
     out = np.empty(n, np.bool_)
     for task in prange((n + _AT_A_TIME - 1) // _AT_A_TIME):
@@ -443,12 +443,12 @@ def _occluded(tree, rays):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _along(a, b, s):  # type: ignore[no-untyped-def]
+def _along(a, b, s):
     return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
 
 
 @inner
-def _squared_distance(corners, tri, p):  # type: ignore[no-untyped-def]
+def _squared_distance(corners, tri, p):
     """Squared distance from a point to a triangle, by the part of it that is nearest.
 
     Source: Ericson, "Real-time collision detection", 2005, section 5.1.5.
@@ -479,7 +479,7 @@ def _squared_distance(corners, tri, p):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def _nearest(tree, points):  # type: ignore[no-untyped-def]
+def _nearest(tree, points):
     n = len(points)
     out, numbers = np.empty(n), np.empty(n, np.uint32)
     for task in prange((n + _AT_A_TIME - 1) // _AT_A_TIME):
@@ -500,11 +500,11 @@ def _nearest(tree, points):  # type: ignore[no-untyped-def]
                 if open_at[top] * (np.float32(1) - _MARGIN) > limit:
                     continue
                 inside = tree.first[box]
-                if tree.count[box] == 0:
+                if tree.triangles[box] == 0:
                     marked = _near_boxes(tree.boxes, inside, rounded, limit, distances)
                     top = _push(marked, inside, distances, stack, open_at, top)
                     continue
-                for k in range(inside, inside + tree.count[box]):
+                for k in range(inside, inside + tree.triangles[box]):
                     square = _squared_distance(tree.corners, k, p)
                     if square < best or (square == best and tree.number[k] < number):
                         best, number = square, tree.number[k]
