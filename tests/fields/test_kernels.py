@@ -21,6 +21,7 @@ from chronoscene.fields.grid import GridLayout, encode, encode_reference
 from chronoscene.fields.mlp import Groups, initial_layers, make_groups, mlp, mlp_reference
 from chronoscene.fields.rows import part_rows
 from chronoscene.kernels.runtime import set_threads
+from chronoscene.training import devices
 
 LAYOUT = GridLayout(levels=4, log2_rows=10, base=4, finest=40)
 
@@ -120,6 +121,20 @@ def test_composite() -> None:
         return joined
 
     assert_like_reference(both(composite), both(composite_reference), [densities, values])
+
+
+def test_plain_torch_tells_the_samples_of_a_ray_apart_behind_many_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In float32, what rays before have summed up would swallow the ray's own depths."""
+    groups = some_groups([1_000, 20])
+    densities = torch.cat((torch.full((1_000,), 1e6), torch.full((20,), 1.0)))
+    values, lengths = torch.linspace(0, 1, 1_020)[:, None], torch.full((1_020,), 0.1)
+    expected = composite(densities, values, lengths, groups)
+    monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
+    assert visible(densities, lengths, groups).starts.tolist() == [0, 1, 21]
+    for found, exact in zip(composite(densities, values, lengths, groups), expected, strict=True):
+        torch.testing.assert_close(found, exact, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
