@@ -203,7 +203,8 @@ def visible(
     starts = groups.starts.numpy()
     counts = np.zeros(len(starts), np.int64)
     _count_visible(*given, starts, counts)
-    return make_groups(torch.from_numpy(np.cumsum(counts)))
+    ends = np.cumsum(counts)
+    return groups if ends[-1] == len(densities) else make_groups(torch.from_numpy(ends))
 
 
 @kernel(fast_math=True, parallel=True)

@@ -55,7 +55,7 @@ def march_reference(
     """
     near, far = torch.full_like(jitter, NEAR), torch.full_like(jitter, float(_FAR))
     for o, d, side in zip(origins.unbind(1), directions.unbind(1), box.sides, strict=True):
-        over = 1 / torch.where(d.abs() > _TINY, d, float(_TINY))
+        over = 1 / torch.where(d.abs() > float(_TINY), d, float(_TINY))
         a, b = (-side - o) * over, (side - o) * over
         near, far = near.maximum(torch.minimum(a, b)), far.minimum(torch.maximum(a, b))
     most = math.ceil(2 * math.hypot(*box.sides) / step) + 1

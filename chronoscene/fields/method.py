@@ -239,9 +239,10 @@ class FieldMethod(ABC):
             most = min(_AT_A_TIME, _RENDERED_SAMPLES // max(len(going), 1))
             taken = (counts[going] - done).clamp_max(most)
             groups = make_groups(torch.cat((taken.new_zeros(1), taken.cumsum(0))))
-            part = Samples(
-                *(part_rows(x, first[going] + done, groups) for x in samples[:3]), groups
+            places, lengths, distances = (
+                part_rows(x, first[going] + done, groups) for x in samples[:3]
             )
+            part = Samples(places, lengths, distances, groups)
             code, clear = Codes(*(code[going] for code in codes)), front.clear[going]
             densities, values, lengths, distances, groups = self._seen(
                 part, rays.directions[going], code, clear
@@ -307,10 +308,10 @@ class FieldMethod(ABC):
             samples = self.march(rays, torch.full_like(pixels, period), middle)
             wide = Codes(*(code.expand(len(pixels), -1) for code in codes))
             drawn, reach = self.draw(rays, samples, wide)
-            alpha = drawn.opacities
-            distance = torch.where(alpha > 0, reach / alpha.clamp_min(1e-9), 0)
+            seen = drawn.opacities
+            distance = torch.where(seen > 0, reach / seen.clamp_min(1e-9), 0)
             depth = distance * rays.depths * self.box.half
-            parts.append(torch.cat((drawn.rgb, alpha[:, None], depth[:, None]), dim=1))
+            parts.append(torch.cat((drawn.rgb, seen[:, None], depth[:, None]), dim=1))
         found = torch.cat(parts).cpu().numpy().reshape(view.height, view.width, 5)
         rgb, alpha = found[..., :3].clip(0, 1), found[..., 3].clip(0, 1)
         return Prediction(rgb=rgb.copy(), alpha=alpha.copy(), depth=found[..., 4].copy())

@@ -130,9 +130,10 @@ class PixelPool:
         else:
             ends = np.cumsum(self.counts[of])
             chosen = devices.integers(generator, int(ends[-1]), count, self._pixels)
-            moves = devices.to_device(self.ends[of] - ends, chosen.device)
-            ends = devices.to_device(ends, chosen.device)
-            chosen = chosen + moves[torch.searchsorted(ends, chosen, right=True)]
+            of_some, moves = (
+                devices.to_device(x, chosen.device) for x in (ends, self.ends[of] - ends)
+            )
+            chosen = chosen + moves[torch.searchsorted(of_some, chosen, right=True)]
         views = torch.searchsorted(self._ends, chosen, right=True)
         sizes, matrices = self._sizes[views], self._matrices[views]
         image = torch.stack(_on_image(self._pixels[chosen], sizes[:, 0]), dim=1)
