@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from pretended_gpu import OnGpu, PretendedGpu
 from torch import Tensor
 
-from chronoscene.fields import compositing, grid, marching, mlp, rows
 from chronoscene.fields.box import SceneBox, contract, contract_reference
 from chronoscene.fields.marching import Samples, march, march_reference
 from chronoscene.fields.method import FieldMethod
@@ -19,7 +19,6 @@ from chronoscene.fields.rays import Rays
 from chronoscene.harness.train.painted_balls import make_training_set
 from chronoscene.methods import build_config, import_object, load_spec
 from chronoscene.training import devices
-from chronoscene.training.optimizers import adam
 
 SMALL = {"samples": 4_096, "levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
 PLAIN = {"encoding": "frequencies", "frequencies": 4, "layers": 2, "hidden": 32, "samples": 4_096}
@@ -39,27 +38,23 @@ GRADIENT_TOLERANCE = 2e-5
 """Of the largest of a tensor. Measured: 6.7e-6."""
 RENDER_TOLERANCE = 5e-6
 """Of colours and opacities, and of depths relatively. Measured: 9e-7."""
-KERNELS = {
-    compositing: ("_composite_forward", "_composite_backward", "_count_visible"),
-    grid: ("encode_forward", "encode_backward"),
-    mlp: ("mlp_forward", "mlp_backward"),
-    marching: ("_march",),
-    rows: ("_copy",),
-    adam: ("adam_tensors", "adam_tensors_alone", "_finite_blocks"),
-}
 
 
 def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
 
 
+def small(name: str) -> FieldMethod:
+    spec = load_spec(name)
+    config = build_config(spec, preset="fast", overrides=CASES[name])
+    method: FieldMethod = import_object(spec.method)(config)
+    return method
+
+
 @pytest.fixture(scope="module", params=list(CASES))
 def trained(request: pytest.FixtureRequest) -> FieldMethod:
-    spec = load_spec(request.param)
-    config = build_config(spec, preset="fast", overrides=CASES[request.param])
-    method: FieldMethod = import_object(spec.method)(config)
-    data = make_training_set(1 if spec.period_input == "none" else 3)
-    method.setup(data, seed=0, device="cpu")
+    method = small(request.param)
+    method.setup(make_training_set(3), seed=0, device="cpu")
     for i in range(WARM_UP):
         method.step(i, i / 100)
     return method
@@ -111,34 +106,31 @@ def test_renders_are_those_of_the_kernels(
     np.testing.assert_allclose(found.depth, expected.depth, rtol=RENDER_TOLERANCE)
 
 
-def test_a_step_and_a_refresh_of_the_occupancy_copy_nothing_to_the_host(
-    trained: FieldMethod, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", CASES)
+def test_a_step_copies_nothing_between_devices_and_mixes_none(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """No array of NumPy and no kernel; photos that were drawn are all that goes to the device."""
-
-    def fail(*args: Any, **kwargs: Any) -> Any:
-        raise AssertionError("of a CPU alone")
-
-    def of_random_numbers(function: Callable[..., Any]) -> Callable[..., Any]:
-        def called(*args: Any) -> Any:
-            assert sys._getframe(1).f_code.co_filename == devices.__file__
-            return function(*args)
-
-        return called
-
-    without_kernels(monkeypatch)
-    for module, names in KERNELS.items():
-        for name in names:
-            monkeypatch.setattr(module, name, fail)
-    for name in ("numpy", "__array__", "cpu"):
-        monkeypatch.setattr(torch.Tensor, name, fail)
-    monkeypatch.setattr(torch, "from_numpy", of_random_numbers(torch.from_numpy))
-    monkeypatch.setattr(torch, "tensor", fail)
-    if not trained.name.startswith("ha-nerf"):
-        monkeypatch.setattr(devices, "to_device", fail)
-        monkeypatch.setattr(sys.modules[FieldMethod.__module__], "to_device", fail)
-    for index in (16, 17, 512):  # With and without a refresh, and one that decides about cells
-        assert trained.step(index, 0.1).skipped is None
+    """On a CPU that pretends to be a GPU; which photos are drawn is all that it is told."""
+    data = make_training_set(3)
+    view, periods = data.views[0], {"geometry_period": 0.0, "appearance_period": 1.5}
+    gpu, method_module = PretendedGpu(), sys.modules[FieldMethod.__module__]
+    for function in ("to_device", "uniform", "integers"):
+        for module in (devices, method_module):
+            monkeypatch.setattr(module, function, getattr(gpu, function), raising=False)
+    monkeypatch.setattr(method_module, "load_tensors", gpu.load_tensors)
+    with gpu:
+        method = small(name)
+        method.setup(data, seed=0, device="cuda")
+        gpu.moves.clear()
+        for index in (16, 17, 512):  # With and without a refresh, and one that decides about cells
+            assert method.step(index, 0.1).skipped is None
+        assert set(gpu.moves) <= ({"to_device"} if name == "ha-nerf" else set())
+        image = method.render_split(view, **periods).rgb
+        method.save(tmp_path)
+        loaded: FieldMethod = type(method)(method.config)
+        loaded.load(tmp_path, device="cuda")
+        assert isinstance(loaded.occupancy.grids[0], OnGpu)
+        np.testing.assert_allclose(loaded.render_split(view, **periods).rgb, image, atol=1e-6)
 
 
 def some_rays(count: int) -> dict[str, Any]:
