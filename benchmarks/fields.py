@@ -35,7 +35,7 @@ class Batch:
     places: Tensor
     directions: Tensor
     codes: tuple[Tensor, Tensor]
-    starts: np.ndarray
+    starts: Tensor
 
 
 def make_batch(seed: int = 0) -> Batch:
@@ -46,13 +46,13 @@ def make_batch(seed: int = 0) -> Batch:
     along = 0.002 * torch.arange(SAMPLES)[:, None]
     places = (origins + along * directions[:, None]).clamp(0, 0.999).reshape(-1, 3)
     codes = tuple(torch.randn(RAYS, size, generator=generator) for size in (GEOMETRY, COLOR))
-    starts = np.arange(0, RAYS * SAMPLES + 1, SAMPLES)
+    starts = torch.arange(0, RAYS * SAMPLES + 1, SAMPLES)
     return Batch(places.contiguous(), directions, (codes[0], codes[1]), starts)
 
 
 def field_step(network: FieldNetwork, batch: Batch) -> None:
     """Evaluate all samples, sum along the rays, and go back."""
-    groups = make_groups(batch.starts)
+    groups = make_groups(batch.starts, len(batch.places))
     densities, features = network.density(batch.places, groups, batch.codes[0])
     values = network.values(features, batch.places, groups, batch.directions, batch.codes[1])
     lengths = torch.full_like(densities, 0.005)

@@ -21,7 +21,7 @@ def _presets(flags: dict[str, Any]) -> dict[str, dict[str, Any]]:
 _COMMON: dict[str, Any] = {
     "period_input": "continuous",
     "outputs": ("rgb", "alpha", "depth"),
-    "devices": ("cpu",),
+    "devices": ("cpu", "cuda"),
     "per_period": ("paper",),
     "mixes_views": True,
     "learns_background": True,

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from baselines.continual_nerf.config import AdaptorConfig
@@ -20,6 +18,7 @@ from chronoscene.fields.mlp import Groups, initial_layers
 from chronoscene.fields.network import SHIFT, Codes, FieldNetwork, named
 from chronoscene.fields.rays import Rays
 from chronoscene.methods import TrainingSet, TrainingView
+from chronoscene.training import devices
 
 _ADAPTOR = 1_004  # Number of a random draw, after the seed
 _FIRST_BIAS = -2.0  # Of the mask: an adaptor begins with a share of 0.12
@@ -68,13 +67,15 @@ class AdaptorNetwork(FieldNetwork):
         mask = features.new_zeros(len(places), 1)
         for i in range(geometry.shape[1]):
             gates = geometry[:, i : i + 1]
-            if not bool(gates.any()):
+            # A GPU evaluates an adaptor that is not asked for rather than be asked.
+            if devices.has_kernels(gates) and not bool(gates.any()):
                 continue
             code = self.encode_with(f"table_{i + 1}", places)
             own = self.mlp(f"expert_{i + 1}", code, none, groups)
-            mask = self.mlp(f"mask_{i + 1}", code, none, groups, "sigmoid")
-            mask = mask * gates.index_select(0, groups.of_row)
-            features = features + mask * (own - features)
+            share = self.mlp(f"mask_{i + 1}", code, none, groups, "sigmoid")
+            share = share * gates.index_select(0, groups.of_row)
+            features = features + share * (own - features)
+            mask = torch.where(gates.any(), share, mask)
         return truncated_exp(features[:, 0] + SHIFT), torch.cat((features, mask), dim=1)
 
     def values(
@@ -129,17 +130,20 @@ class CLNerf(ReplayMethod):
     def replayed_view(self, view: TrainingView) -> TrainingView:
         return replace(view, period=self.train.num_periods - 1)
 
-    def gates(self, periods: NDArray[np.floating]) -> Tensor:
+    def gates(self, periods: Tensor) -> Tensor:
         """Return by how much each adaptor takes part in periods. [R] -> [R, T - 1]"""
-        numbers = np.arange(int(self.meta["num_periods"]) - 1)
-        return self.tensor(np.clip(periods[:, None] - numbers, 0, 1).astype(np.float32))
+        numbers = torch.arange(int(self.meta["num_periods"]) - 1, device=periods.device)
+        return (periods[:, None] - numbers).clamp(0, 1).float()
 
     def codes(self, rays: Rays) -> Codes:
-        gates = self.gates(self.pool.periods[rays.views].astype(np.float64))
+        gates = self.gates(self.pool.periods[rays.views].double())
         return Codes(gates, gates[:, :0])
 
     def view_codes(self, geometry_period: float, appearance_period: float) -> Codes:
-        geometry, color = self.gates(np.array([geometry_period, appearance_period])).split(1)
+        geometry, color = (
+            self.gates(torch.full((1,), period, dtype=torch.float64, device=self.device))
+            for period in (geometry_period, appearance_period)
+        )
         return Codes(geometry, color[:, :0] if geometry_period == appearance_period else color)
 
     def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:
@@ -148,6 +152,6 @@ class CLNerf(ReplayMethod):
         loss = super().loss(drawn, rays, progress) + self.config.change_weight * change.mean()
         if self.replayed == 0:
             return loss
-        old = self.tensor((rays.views < self.replayed).astype(np.float32))
-        squares = (drawn.rgb - self.tensor(rays.colors)).square()
+        old = (rays.views < self.replayed).float()
+        squares = (drawn.rgb - rays.colors).square()
         return loss - ((old * change.detach())[:, None] * squares).mean()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,7 +37,7 @@ class CLNeRF(ReplayMethod):
         return params
 
     def codes(self, rays: Rays) -> Codes:
-        periods = self.tensor(self.pool.periods[rays.views])
+        periods = self.pool.periods[rays.views]
         names = "geometry", "appearance"
         return Codes(*(self.network.params[name].index_select(0, periods) for name in names))
 
@@ -54,8 +53,8 @@ class CLNeRF(ReplayMethod):
         loss = super().loss(drawn, rays, progress)
         if self.config.replay_loss == "squared" or self.replayed == 0:
             return loss
-        squares = (drawn.rgb - self.tensor(rays.colors)).square()
-        old = self.tensor((rays.views < self.replayed).astype(np.float32))[:, None]
+        squares = (drawn.rgb - rays.colors).square()
+        old = (rays.views < self.replayed).float()[:, None]
         weight = (1 + math.cos(math.pi * (1 + progress))) / 2
         robust = weight * torch.sqrt(squares + _CHARBONNIER)
         return loss + (old * (robust - squares)).mean()

@@ -119,7 +119,7 @@ class ReplayMethod(FieldMethod):
                 return train.load_mask(i - len(old))
             return photos[old[i]][1] if old[i] in photos else None
 
-        return PixelPool(views, load_image, load_mask, seed=self.seed)
+        return PixelPool(views, load_image, load_mask, seed=self.seed, device=self.device)
 
     def _replayed(self) -> list[int]:
         """Numbers of the earlier views that are shown again."""

@@ -31,7 +31,7 @@ def _presets(flags: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 _COMMON: dict[str, Any] = {
     "outputs": ("rgb", "alpha", "depth"),
-    "devices": ("cpu",),
+    "devices": ("cpu", "cuda"),
     "config": "baselines.nerf.config:NerfConfig",
     "mixes_views": True,
     "learns_background": True,

@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import pad, unfold
 
-from chronoscene.fields.mlp import initial_layers, make_groups, mlp
+from chronoscene.fields.mlp import equal_groups, initial_layers, mlp
 
 _FILTERS = ((7, 1), (4, 2), (4, 2), (4, 2), (4, 2))
 """Edge and stride of each convolution."""
@@ -60,5 +60,5 @@ def _convolve(x: Tensor, layers: Sequence[Tensor], edge: int, stride: int) -> Te
 
 
 def _each_row(x: Tensor, layers: Sequence[Tensor]) -> Tensor:
-    groups = make_groups(np.arange(len(x) + 1), x.device)
+    groups = equal_groups(len(x), 1, x.device)
     return mlp(x, x.new_zeros(len(x), 0), groups, layers)

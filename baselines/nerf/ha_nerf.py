@@ -68,12 +68,12 @@ class HaNerf(Nerf):
             generator, self.num_rays, np.sort(generator.choice(seen, count, replace=False))
         )
 
-    def lights(self, views: NDArray[np.int64]) -> Tensor:
+    def lights(self, views: Tensor) -> Tensor:
         assert self.photos is not None
-        found, places = np.unique(views, return_inverse=True)
-        photos = self.photos.index_select(0, self.tensor(found))
+        found, places = views.unique(return_inverse=True)
+        photos = self.photos.index_select(0, found)
         self._codes = encode_photos(photos, self.network.layers("encoder"))
-        return self._codes.index_select(0, self.tensor(places))
+        return self._codes.index_select(0, places)
 
     def mean_light(self, weights: NDArray[np.float32]) -> Tensor:
         return (self.tensor(weights)[:, None] * self.period_lights()).sum(0, keepdim=True)
@@ -86,7 +86,7 @@ class HaNerf(Nerf):
         if self._means is None:
             layers = self.network.layers("encoder")
             codes = torch.cat([encode_photos(part, layers) for part in self.photos.split(_BATCH)])
-            periods = self.tensor(self.pool.periods)
+            periods = self.pool.periods
             chosen = [codes[periods == i] for i in range(int(self.meta["num_periods"]))]
             self._means = torch.stack([part.sum(0) / max(len(part), 1) for part in chosen])
         return self._means

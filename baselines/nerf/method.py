@@ -13,7 +13,7 @@ from baselines.nerf.config import NerfConfig
 from baselines.nerf.network import ContentNetwork, NerfNetwork
 from baselines.nerf.time import FIRST_WIDTH, step_code, wave_code
 from chronoscene.fields.method import Drawn, FieldMethod
-from chronoscene.fields.mlp import initial_layers, make_groups, mlp
+from chronoscene.fields.mlp import equal_groups, initial_layers, mlp
 from chronoscene.fields.network import Codes, FieldNetwork, frequency_code, named
 from chronoscene.fields.rays import Rays
 from chronoscene.methods import TrainingSet
@@ -68,33 +68,39 @@ class Nerf(FieldMethod):
             return wave_code(times, self.config.time_frequencies)
         return torch.zeros(len(times), 0, device=times.device)
 
-    def times(self, periods: np.ndarray) -> Tensor:
+    def times(self, periods: Tensor) -> Tensor:
         """Return the times of periods, 0 at the first and 1 at the last. [R]"""
         last = max(int(self.meta["num_periods"]) - 1, 1)
-        return self.tensor((periods / last).astype(np.float32))
+        return (periods.double() / last).float()
 
     def codes(self, rays: Rays) -> Codes:
         params = self.network.params
-        every = self.time_code(self.times(np.arange(int(self.meta["num_periods"]))))
-        color = every.index_select(0, self.tensor(self.pool.periods[rays.views]))
+        periods = torch.arange(int(self.meta["num_periods"]), device=self.device)
+        every = self.time_code(self.times(periods))
+        color = every.index_select(0, self.pool.periods[rays.views])
         if self.config.appearance != "none":
             color = torch.cat((color, self.lights(rays.views)), dim=1)
         geometry = color[:, :0]
         if "transient_codes" in params:
-            geometry = params["transient_codes"].index_select(0, self.tensor(rays.views))
+            geometry = params["transient_codes"].index_select(0, rays.views)
         return Codes(geometry, color)
 
-    def lights(self, views: NDArray[np.int64]) -> Tensor:
+    def lights(self, views: Tensor) -> Tensor:
         """Return the code of the light of each photo. [R] -> [R, A]"""
-        return self.network.params["light_codes"].index_select(0, self.tensor(views))
+        return self.network.params["light_codes"].index_select(0, views)
 
     def view_codes(self, geometry_period: float, appearance_period: float) -> Codes:
         """Return the codes of a view; no transient things."""
         weights = period_weights(appearance_period, int(self.meta["num_periods"]))
-        color = self.time_code(self.times(np.array([appearance_period])))
+        period = torch.full((1,), appearance_period, dtype=torch.float64, device=self.device)
+        color = self.time_code(self.times(period))
         if self.config.appearance != "none":
             color = torch.cat((color, self.mean_light(weights)), dim=1)
         return Codes(color[:, :0], color)
+
+    def geometry_code(self, period: int) -> Tensor:
+        del period
+        return torch.zeros(1, 0, device=self.device)
 
     def mean_light(self, weights: NDArray[np.float32]) -> Tensor:
         """Return the mean code of the photos of periods with weights. [T] -> [1, A]"""
@@ -105,7 +111,7 @@ class Nerf(FieldMethod):
         return (shares[:, None] * lights).sum(0, keepdim=True) / shares.sum()
 
     def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:
-        target = self.tensor(rays.colors)
+        target = rays.colors
         squares = (drawn.rgb - target).square()
         if self.config.transient == "density":
             return self._uncertain_loss(squares, drawn)
@@ -142,10 +148,9 @@ class Nerf(FieldMethod):
 
     def _masks(self, rays: Rays) -> Tensor:
         """Return how much of what rays show is in their photo alone, 0..1. [R, 1]"""
-        views = self.tensor(rays.views)
-        codes = self.network.params["mask_codes"].index_select(0, views)
-        places = frequency_code(self.tensor(rays.pixels), _PIXEL_FREQUENCIES)
-        groups = make_groups(np.arange(len(views) + 1), self.device)
+        codes = self.network.params["mask_codes"].index_select(0, rays.views)
+        places = frequency_code(rays.pixels, _PIXEL_FREQUENCIES)
+        groups = equal_groups(len(places), 1, self.device)
         return mlp(places, codes, groups, self.network.layers("mask"), "sigmoid")
 
 

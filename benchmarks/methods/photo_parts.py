@@ -40,9 +40,9 @@ def values(method: FieldMethod, view: View, codes: Codes) -> NDArray[np.float32]
     """Render a view with codes of one row: colours and what is behind them. [H, W, C]"""
     parts = []
     for first in range(0, view.width * view.height, RAYS):
-        rays = view_rays(view, np.arange(first, min(first + RAYS, view.width * view.height)))
-        count = len(rays.views)
-        samples = method.march(rays, np.zeros(count, np.int64), np.full(count, 0.5, np.float32))
+        rays = view_rays(view, torch.arange(first, min(first + RAYS, view.width * view.height)))
+        count, middle = len(rays.views), torch.full_like(rays.depths, 0.5)
+        samples = method.march(rays, torch.zeros_like(rays.views), middle)
         drawn, _ = method.draw(rays, samples, Codes(*(code.expand(count, -1) for code in codes)))
         parts.append(torch.cat((drawn.rgb, drawn.values[:, 3:]), dim=1))
     return torch.cat(parts).reshape(view.height, view.width, -1).numpy()

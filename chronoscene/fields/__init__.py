@@ -8,7 +8,8 @@ What comes in is a `TrainingSet`; a subclass of `method.FieldMethod` says what t
   of rays.
 - `rays`: pixels of all photos, and their rays. `network`: a field of these; `method`: training.
 
-`grid`, `mlp`, `compositing` and `rows` have a definition in plain torch each, which a GPU runs, and
-kernels for float32 on a CPU, those of `grid` and `mlp` in ``*_kernels``. Values and gradients of
-the kernels have equal bits for any number of threads.
+`marching`, `grid`, `mlp`, `compositing` and `rows` have a definition in plain torch each, which a
+GPU runs, and kernels for float32 on a CPU, those of `grid` and `mlp` in ``*_kernels``. Values and
+gradients of the kernels have equal bits for any number of threads. On a GPU pixels, occupancy and
+samples stay there; a step asks it twice how many samples there are, and once how it went.
 """

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy import float32
-from numpy.typing import NDArray
+from torch import Tensor
 
 from chronoscene.kernels.compilation import inlined
 from chronoscene.methods import TrainingSet, View
@@ -36,9 +37,10 @@ class SceneBox:
     sides: tuple[float, float, float]
     """Half edges of the box within the cube, at most 1."""
 
-    def to_cube(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
+    def to_cube(self, points: Tensor) -> Tensor:
         """Move points of the training frame into the coordinates of the cube. [N, 3]"""
-        return ((points - np.array(self.centre)) / self.half).astype(np.float32)
+        axes = zip(points.double().unbind(1), self.centre, strict=True)
+        return torch.stack([(x - middle) / self.half for x, middle in axes], dim=1).float()
 
 
 def box_of(train: TrainingSet) -> SceneBox:
@@ -76,3 +78,9 @@ def contract(x, y, z):  # type: ignore[no-untyped-def]
         float32((y * scale + _TWO) * _QUARTER),
         float32((z * scale + _TWO) * _QUARTER),
     )
+
+
+def contract_reference(places: Tensor) -> Tensor:
+    """Move places into the unit cube in plain torch: the definition of `contract`. [..., 3]"""
+    n = places.abs().amax(-1, keepdim=True).clamp_min(1)
+    return (places * ((2 - 1 / n) / n) + 2) / 4

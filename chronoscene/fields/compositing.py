@@ -13,11 +13,10 @@ import numpy as np
 import torch
 from numba import prange
 from numpy import float32
-from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.checks import check_shape
-from chronoscene.fields.mlp import Groups
+from chronoscene.fields.mlp import Groups, make_groups
 from chronoscene.kernels.compilation import kernel
 from chronoscene.training import devices
 
@@ -37,15 +36,22 @@ def composite_reference(
         clear: Transmittance before the first sample, if not 1. [R]
     """
     depths = densities * lengths
-    before = torch.cumsum(depths, 0) - depths  # of all rays, so that of the ray's start goes off
-    before = before - before[groups.starts[:-1].clamp_max(len(depths) - 1)][groups.of_row.long()]
-    index = groups.of_row.long()
-    passed = torch.exp(-before) if clear is None else torch.exp(-before) * clear[index]
+    passed = _passed(depths, groups, clear)
     weights = torch.where(passed >= STOP, passed * (1 - torch.exp(-depths)), 0.0)
-    rays = len(groups.starts) - 1
+    index, rays = groups.of_row.long(), len(groups.starts) - 1
     shape = (rays, values.shape[1])
     sums = values.new_zeros(shape).index_add(0, index, weights[:, None] * values)
     return sums, weights.new_zeros(rays).index_add(0, index, weights)
+
+
+def _passed(depths: Tensor, groups: Groups, clear: Tensor | None) -> Tensor:
+    """Transmittance before each sample. [N]"""
+    # The sum runs over all rays, far beyond what float32 can tell apart in one of them.
+    every = torch.cumsum(depths.double(), 0) - depths
+    starts = groups.starts[:-1].clamp_max(max(len(depths) - 1, 0))
+    before = every - every[starts].index_select(0, groups.of_row)
+    passed = torch.exp(-before).to(depths)
+    return passed if clear is None else passed * clear.index_select(0, groups.of_row)
 
 
 def composite(
@@ -175,8 +181,8 @@ class Front:
 @torch.no_grad()
 def visible(
     densities: Tensor, lengths: Tensor, groups: Groups, clear: Tensor | None = None
-) -> NDArray[np.int64]:
-    """Count the samples that have a weight: the first ones of each ray.
+) -> Groups:
+    """Find the samples that have a weight: the first ones of each ray.
 
     Args:
         densities: Not negative. [N]
@@ -185,14 +191,20 @@ def visible(
         clear: Transmittance before the first of them, if not 1. [R]
 
     Returns:
-        starts: First of each ray among them, and the number of all. [R + 1]
+        Groups of them alone.
     """
+    if not devices.has_kernels(densities, lengths):
+        kept = _passed(densities * lengths, groups, clear) >= STOP
+        of_row = groups.of_row.index_select(0, kept.nonzero()[:, 0])
+        before = torch.cat((groups.starts[:1], kept.cumsum(0)))
+        return Groups(before.index_select(0, groups.starts), of_row)
     clear = densities.new_ones(len(groups.starts) - 1) if clear is None else clear
-    given = [t.detach().cpu().contiguous().numpy() for t in (densities, lengths, clear)]
-    starts = groups.starts.cpu().numpy()
+    given = [t.detach().contiguous().numpy() for t in (densities, lengths, clear)]
+    starts = groups.starts.numpy()
     counts = np.zeros(len(starts), np.int64)
     _count_visible(*given, starts, counts)
-    return np.cumsum(counts)
+    ends = np.cumsum(counts)
+    return groups if ends[-1] == len(densities) else make_groups(torch.from_numpy(ends))
 
 
 @kernel(fast_math=True, parallel=True)
@@ -212,7 +224,8 @@ class _TruncatedExp(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor) -> Tensor:
         # NumPy makes one pass, where torch may take another path at the end of a thread's share.
         clipped = x.detach().clamp(max=_LIMIT).contiguous()
-        out = clipped.exp() if x.is_cuda else torch.from_numpy(np.exp(clipped.numpy()))
+        kernels = devices.has_kernels(x)
+        out = torch.from_numpy(np.exp(clipped.numpy())) if kernels else clipped.exp()
         ctx.save_for_backward(out)
         return out
 
@@ -226,13 +239,13 @@ class _Softplus(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         ctx.x = x.detach()
-        if x.is_cuda:
+        if not devices.has_kernels(ctx.x):
             return torch.nn.functional.softplus(ctx.x)
         return torch.from_numpy(np.logaddexp(ctx.x.numpy(), 0, dtype=ctx.x.numpy().dtype))
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        if ctx.x.is_cuda:
+        if not devices.has_kernels(ctx.x):
             return grads[0] * ctx.x.sigmoid()
         return grads[0] / (1 + torch.from_numpy(np.exp(-ctx.x.numpy().clip(-80))))
 

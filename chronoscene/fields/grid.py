@@ -76,24 +76,27 @@ def encode_reference(places: Tensor, table: Tensor, layout: GridLayout) -> Tenso
     i + (R + 1) (j + (R + 1) k) on a dense level, else (i xor 2654435761 j xor 805459861 k) mod the
     rows of the level.
     """
-    parts = []
+    rows, weights = [], []
     for level, cells in enumerate(layout.resolutions.tolist()):
         start, end = layout.starts[level : level + 2].tolist()
         scaled = places * cells
         lower = scaled.detach().floor()
         share = scaled - lower
-        total = torch.zeros(len(places), FEATURES, dtype=table.dtype, device=table.device)
-        for corner in range(8):
-            bits = torch.tensor([corner >> axis & 1 for axis in range(3)], device=places.device)
-            weight = torch.where(bits.bool(), share, 1 - share).prod(dim=1, keepdim=True)
-            x, y, z = (lower.long() + bits).unbind(1)
-            if layout.dense[level]:
-                row = x + (cells + 1) * (y + (cells + 1) * z)
-            else:
-                row = (x ^ y * _PRIMES[1] ^ z * _PRIMES[2]) % (end - start)
-            total = total + weight * table.index_select(0, start + row)
-        parts.append(total)
-    return torch.cat(parts, dim=1)
+        # Of both sides of the cell along each axis, then of the 2 x 2 x 2 corners. [2, N] each
+        x, y, z = torch.stack((lower, lower + 1)).long().unbind(2)
+        wx, wy, wz = torch.stack((1 - share, share)).unbind(2)
+        y, z = y[:, None], z[:, None, None]
+        if layout.dense[level]:
+            row = x + (cells + 1) * (y + (cells + 1) * z)
+        else:
+            row = (x ^ y * _PRIMES[1] ^ z * _PRIMES[2]) % (end - start)
+        rows.append(start + row)
+        weights.append(wx * wy[:, None] * wz[:, None, None])
+    # Once for all rows: the gradient of each such call is as large as the table.
+    features = table.index_select(0, torch.stack(rows).flatten())
+    corners = torch.stack(weights).view(layout.levels, 8, -1, 1)
+    mixed = (corners * features.view(layout.levels, 8, -1, FEATURES)).sum(1)
+    return mixed.transpose(0, 1).flatten(1)
 
 
 class _Encode(torch.autograd.Function):

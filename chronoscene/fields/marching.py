@@ -6,12 +6,15 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numba import prange
 from numpy import float32
-from numpy.typing import NDArray
+from torch import Tensor
 
-from chronoscene.fields.box import SceneBox, contract
+from chronoscene.fields.box import SceneBox, contract, contract_reference
+from chronoscene.fields.mlp import Groups, make_groups
 from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.training import devices
 
 NEAR = 0.01
 """Distance from the camera at which the first sample may be, in half edges of the cube."""
@@ -26,27 +29,78 @@ ZERO, ONE, TWO = float32(0), float32(1), float32(2)
 class Samples(NamedTuple):
     """Samples of some rays, near ones first."""
 
-    places: NDArray[np.float32]
+    places: Tensor
     """In the unit cube, contracted. [N, 3]"""
-    lengths: NDArray[np.float32]
+    lengths: Tensor
     """Lengths that they stand for, in half edges of the cube; contracted outside. [N]"""
-    distances: NDArray[np.float32]
+    distances: Tensor
     """From the camera, in half edges of the cube. [N]"""
-    starts: NDArray[np.int64]
-    """First sample of each ray, and the number of all. [R + 1]"""
+    groups: Groups
+    """Samples of each ray."""
 
 
-def march(
-    origins: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    periods: NDArray[np.int64],
-    jitter: NDArray[np.float32],
-    grids: tuple[NDArray[np.uint8], ...],
+def march_reference(
+    origins: Tensor,
+    directions: Tensor,
+    periods: Tensor,
+    jitter: Tensor,
+    grids: tuple[Tensor, ...],
     box: SceneBox,
     step: float,
     shells: int,
 ) -> Samples:
-    """Place samples on rays.
+    """Place samples on rays in plain torch: the definition of `march`.
+
+    It looks at each place where a sample could be; the kernel leaps over empty cells.
+    """
+    near, far = torch.full_like(jitter, NEAR), torch.full_like(jitter, float(_FAR))
+    for o, d, side in zip(origins.unbind(1), directions.unbind(1), box.sides, strict=True):
+        over = 1 / torch.where(d.abs() > float(_TINY), d, float(_TINY))
+        a, b = (-side - o) * over, (side - o) * over
+        near, far = near.maximum(torch.minimum(a, b)), far.minimum(torch.maximum(a, b))
+    most = math.ceil(2 * math.hypot(*box.sides) / step) + 1
+    numbers = torch.arange(most, device=jitter.device)
+    inner_at = near[:, None] + (jitter[:, None] + numbers) * step
+    start = torch.where(far > near, far, NEAR)[:, None]
+    shares = torch.arange(shells + 1, device=jitter.device) / max(shells, 1)
+    middles = (shares[:-1] + jitter[:, None] / max(shells, 1)).clamp_max(float(_LAST))
+    edges = start + shares.clamp_max(float(_LAST)) / (1 - shares.clamp_max(float(_LAST)))
+    outer_at = start + middles / (1 - middles)
+
+    def places(at: Tensor) -> Tensor:
+        return origins[:, None] + at[..., None] * directions[:, None]
+
+    def occupied(unit: Tensor, grid: Tensor) -> Tensor:
+        """Read the cells of places in a unit cube."""
+        cells = grid.shape[1]
+        i, j, k = (unit * cells).long().clamp(0, cells - 1).unbind(-1)
+        return grid[periods[:, None], i, j, k] != 0
+
+    inside = occupied((places(inner_at) + 1) / 2, grids[0]) & (inner_at < far[:, None])
+    outside = occupied(contract_reference(places(outer_at)), grids[1])
+    found = torch.cat((inside, outside), dim=1)
+    ray, column = found.nonzero().unbind(1)
+    # The contracted cube of edge 4 became the unit cube.
+    lengths = 4 * contract_reference(places(edges)).diff(dim=1).norm(dim=2)
+    lengths = torch.cat((torch.full_like(inner_at, step), lengths), dim=1)[ray, column]
+    distances = torch.cat((inner_at, outer_at), dim=1)[ray, column]
+    at = origins[ray] + distances[:, None] * directions[ray]
+    starts = torch.cat((ray.new_zeros(1), found.sum(1).cumsum(0)))
+    unit = contract_reference(at).clamp_max(float(_LAST))
+    return Samples(unit, lengths, distances, Groups(starts, ray.int()))
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    periods: Tensor,
+    jitter: Tensor,
+    grids: tuple[Tensor, ...],
+    box: SceneBox,
+    step: float,
+    shells: int,
+) -> Samples:
+    """Place samples on rays: `march_reference`, compiled for float32 on a CPU.
 
     In the box they are ``step`` apart and lie in occupied cells. Behind it come ``shells`` others,
     at distances 1 s / (1 - s) for evenly spaced s, in occupied cells of the outer grid.
@@ -54,37 +108,31 @@ def march(
     Args:
         origins: Camera centres in the coordinates of the cube. [R, 3]
         directions: Unit vectors. [R, 3]
-        periods: Period of each ray. [R]
+        periods: Period of each ray. int64 [R]
         jitter: Share of a step by which the samples of a ray are moved, 0..1. [R]
-        grids: Occupied cells of the cube, and of the contracted unit cube. [T, G, G, G] each
+        grids: Occupied cells of the cube, and of the contracted unit cube. uint8 [T, G, G, G] each
         box: The box.
         step: In half edges of the cube.
         shells: Samples of a ray outside of the box, at most.
     """
+    if not devices.has_kernels(origins, directions, jitter):
+        return march_reference(origins, directions, periods, jitter, grids, box, step, shells)
     sides = np.array(box.sides, np.float32)
     rays = len(origins)
     starts = np.zeros(rays + 1, np.int64)
     nothing = np.empty((0, 3), np.float32), np.empty(0, np.float32), np.empty(0, np.float32)
     found = np.empty(rays, np.float32), np.empty(rays, np.int64)
-    fixed = (
-        origins,
-        directions,
-        periods,
-        jitter,
-        *grids,
-        sides,
-        float32(step),
-        shells,
-        *found,
-        starts,
-    )
+    given = (x.numpy() for x in (origins, directions, periods, jitter, *grids))
+    fixed = *given, sides, float32(step), shells, *found, starts
     _march(*fixed, False, *nothing)
     np.cumsum(starts, out=starts)
     count = int(starts[-1])
     places = np.empty((count, 3), np.float32)
     lengths, distances = np.empty(count, np.float32), np.empty(count, np.float32)
     _march(*fixed, True, places, lengths, distances)
-    return Samples(places, lengths, distances, starts)
+    arrays = map(torch.from_numpy, (places, lengths, distances, starts))
+    unit, sizes, along, firsts = arrays
+    return Samples(unit, sizes, along, make_groups(firsts, count))
 
 
 @inner(fast_math=True)

@@ -19,7 +19,7 @@ from chronoscene.fields.box import SceneBox, box_of, sensible_cells
 from chronoscene.fields.compositing import STOP, Front, composite, visible
 from chronoscene.fields.config import FieldConfig
 from chronoscene.fields.marching import Samples, march
-from chronoscene.fields.mlp import Groups, make_groups
+from chronoscene.fields.mlp import Groups, equal_groups, make_groups
 from chronoscene.fields.network import Codes, FieldNetwork
 from chronoscene.fields.occupancy import INTERVAL, Occupancy, start_occupancy
 from chronoscene.fields.rays import PixelPool, Rays, view_rays
@@ -33,7 +33,7 @@ from chronoscene.training.checkpoint import (
     parts,
     save_tensors,
 )
-from chronoscene.training.devices import to_device
+from chronoscene.training.devices import to_device, uniform
 from chronoscene.training.optimizers.adam import Adam, all_finite
 from chronoscene.training.periods import period_weights
 
@@ -95,9 +95,13 @@ class FieldMethod(ABC):
     def view_codes(self, geometry_period: float, appearance_period: float) -> Codes:
         """Return the codes of a view that is rendered, in one row."""
 
+    def geometry_code(self, period: int) -> Tensor:
+        """Return the geometry code of a period, in one row."""
+        return self.view_codes(period, period).geometry
+
     def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:
         """Return what a step minimises: the squared error, and little for half-opaque rays."""
-        error = (drawn.rgb - self.tensor(rays.colors)).square().mean()
+        error = (drawn.rgb - rays.colors).square().mean()
         opacities = drawn.opacities.clamp(1e-5, 1)
         entropy = -(opacities * torch.log(opacities)).mean()
         return error + self.config.opacity_weight * entropy
@@ -112,7 +116,7 @@ class FieldMethod(ABC):
         cells = min(self.config.cells, sensible_cells(train.views, self.box))
         grids = train.num_periods if self.geometry_varies else 1
         self.occupancy = start_occupancy(
-            train, self.box, self.pool, grids, cells, self.config.spacing
+            train, self.box, self.pool, grids, cells, self.config.spacing, device
         )
         self.meta = {
             "method": self.name,
@@ -129,7 +133,12 @@ class FieldMethod(ABC):
     def make_pool(self, train: TrainingSet) -> PixelPool:
         """Read the photos of a training set."""
         return PixelPool(
-            train.views, train.load_image, train.load_mask, expect=train.expect, seed=self.seed
+            train.views,
+            train.load_image,
+            train.load_mask,
+            expect=train.expect,
+            seed=self.seed,
+            device=self.device,
         )
 
     def begin(self, params: Mapping[str, Tensor]) -> None:
@@ -151,7 +160,7 @@ class FieldMethod(ABC):
         if len(self.pool) == 0:
             return StepReport(0.0, count, "empty")
         rays = self.draw_rays(generator)
-        jitter = generator.random(len(rays.views), np.float32)
+        jitter = uniform(generator, (len(rays.views),), rays.depths)
         samples = self.march(rays, self.pool.periods[rays.views], jitter)
         if len(samples.lengths) == 0:
             return StepReport(0.0, count, "empty")
@@ -164,11 +173,13 @@ class FieldMethod(ABC):
         gradients = self.optimizer.gradients().items()
         found = {name: grad for name, grad in gradients if not name.startswith("table")}
         found["loss"] = loss.detach()
-        if not all_finite(list(found.values())):
+        finite = all_finite(list(found.values())).to(found["loss"])
+        value, sound = torch.stack((found["loss"], finite)).tolist()
+        if not sound:
             wrong = tuple(name for name, tensor in found.items() if not all_finite([tensor]))
-            return StepReport(loss.item(), count, "not finite", wrong)
+            return StepReport(value, count, "not finite", wrong)
         self.optimizer.step(self.rates(progress))
-        return StepReport(loss.item(), count)
+        return StepReport(value, count)
 
     def rates(self, progress: float) -> dict[str, float]:
         """Return the learning rate of each tensor: a cosine from 1 to the final share."""
@@ -200,9 +211,9 @@ class FieldMethod(ABC):
         """Copy an array to the device of the field."""
         return to_device(np.ascontiguousarray(array), self.device)
 
-    def march(self, rays: Rays, periods: NDArray[np.int64], jitter: NDArray[np.float32]) -> Samples:
+    def march(self, rays: Rays, periods: Tensor, jitter: Tensor) -> Samples:
         """Place samples on rays."""
-        periods = np.minimum(periods, len(self.occupancy.grids[0]) - 1)
+        periods = periods.clamp_max(len(self.occupancy.grids[0]) - 1)
         origins = self.box.to_cube(rays.origins)
         fixed = self.occupancy.grids, self.box, self.occupancy.step, self.config.shells
         return march(origins, rays.directions, periods, jitter, *fixed)
@@ -211,10 +222,7 @@ class FieldMethod(ABC):
         """Evaluate the field at samples and sum along the rays; returns mean distances, too."""
         if not torch.is_grad_enabled():
             return self._draw_until_opaque(rays, samples, codes)
-        places, lengths, distances = map(self.tensor, samples[:3])
-        densities, values, lengths, distances, groups = self._seen(
-            places, lengths, distances, samples.starts, self.tensor(rays.directions), codes
-        )
+        densities, values, lengths, distances, groups = self._seen(samples, rays.directions, codes)
         sums, opacities = composite(densities, values, lengths, groups)
         with torch.no_grad():
             reach, _ = composite(densities.detach(), distances[:, None], lengths, groups)
@@ -224,45 +232,36 @@ class FieldMethod(ABC):
         self, rays: Rays, samples: Samples, codes: Codes
     ) -> tuple[Drawn, Tensor]:
         """Do the same from the camera on, each ray until nothing behind is seen; equal bits."""
-        front, directions = Front(len(rays.views), self.device), self.tensor(rays.directions)
-        given = tuple(map(self.tensor, samples[:3]))
-        counts, done = np.diff(samples.starts), 0
-        going = np.flatnonzero(counts)
+        front, first = Front(len(rays.views), self.device), samples.groups.starts[:-1]
+        counts, done = samples.groups.starts.diff(), 0
+        going = counts.nonzero()[:, 0]
         while done == 0 or len(going):
             most = min(_AT_A_TIME, _RENDERED_SAMPLES // max(len(going), 1))
-            taken = np.minimum(counts[going] - done, most)
-            starts = np.concatenate(([0], np.cumsum(taken)))
-            first, these = samples.starts[going] + done, self.tensor(going)
-            places, lengths, distances = (part_rows(x, first, starts) for x in given)
-            code, clear = Codes(*(code[these] for code in codes)), front.clear[these]
+            taken = (counts[going] - done).clamp_max(most)
+            groups = make_groups(torch.cat((taken.new_zeros(1), taken.cumsum(0))))
+            places, lengths, distances = (
+                part_rows(x, first[going] + done, groups) for x in samples[:3]
+            )
+            part = Samples(places, lengths, distances, groups)
+            code, clear = Codes(*(code[going] for code in codes)), front.clear[going]
             densities, values, lengths, distances, groups = self._seen(
-                places, lengths, distances, starts, directions[these], code, clear
+                part, rays.directions[going], code, clear
             )
             values = torch.cat((values, distances[:, None]), dim=1)
-            front.add(these, densities, values, lengths, groups)
+            front.add(going, densities, values, lengths, groups)
             done += most
-            going = going[(front.clear.cpu().numpy()[going] >= STOP) & (counts[going] > done)]
+            going = going[((front.clear[going] >= STOP) & (counts[going] > done)).nonzero()[:, 0]]
         return Drawn(front.sums[:, :-1], 1 - front.clear, self.background), front.sums[:, -1]
 
     def _seen(
-        self,
-        places: Tensor,
-        lengths: Tensor,
-        distances: Tensor,
-        starts: NDArray[np.int64],
-        directions: Tensor,
-        codes: Codes,
-        clear: Tensor | None = None,
+        self, samples: Samples, directions: Tensor, codes: Codes, clear: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Groups]:
         """Evaluate densities, and values where something is seen.
 
         What is hidden has no weight and no gradient, and is left out.
 
         Args:
-            places: In the unit cube. [N, 3]
-            lengths: [N]
-            distances: [N]
-            starts: First sample of each ray, and the number of all. [R + 1]
+            samples: Samples of some rays.
             directions: [R, 3]
             codes: [R, ...]
             clear: Transmittance before the first sample of each ray, if not 1. [R]
@@ -270,28 +269,25 @@ class FieldMethod(ABC):
         Returns:
             Densities, values, lengths, distances and groups of the samples that are seen.
         """
-        groups = make_groups(starts, self.device)
+        places, lengths, distances, groups = samples
         densities, features = self.network.density(places, groups, codes.geometry)
-        ends = visible(densities, lengths, groups, clear)
-        if ends[-1] < len(places):
-            groups = make_groups(ends, self.device)
-            every = densities, features, places, lengths, distances
+        seen = visible(densities, lengths, groups, clear)
+        if len(seen.of_row) < len(places):
+            every, first = (densities, features, places, lengths, distances), groups.starts[:-1]
             densities, features, places, lengths, distances = (
-                part_rows(x, starts[:-1], ends) for x in every
+                part_rows(x, first, seen) for x in every
             )
+            groups = seen
         values = self.network.values(features, places, groups, directions, codes.color)
         return densities, values, lengths, distances, groups
 
     @torch.no_grad()
-    def probe(self, places: NDArray[np.float32], period: int) -> NDArray[np.float32]:
+    def probe(self, places: Tensor, period: int) -> Tensor:
         """Return the densities at contracted places in a period. [N]"""
         # Groups of a fixed size, so that there is work for all threads.
-        starts = np.append(np.arange(0, len(places), 1_024), len(places))
-        groups = make_groups(starts, self.device)
-        code = self.view_codes(period, period).geometry.expand(len(starts) - 1, -1)
-        densities, _ = self.network.density(self.tensor(places), groups, code)
-        found: NDArray[np.float32] = densities.cpu().numpy()
-        return found
+        groups = equal_groups(len(places), 1_024, self.device)
+        code = self.geometry_code(period).expand(len(groups.starts) - 1, -1)
+        return self.network.density(places, groups, code)[0]
 
     def render(self, view: View, period: float) -> Prediction:
         return self.render_split(view, geometry_period=period, appearance_period=period)
@@ -304,20 +300,19 @@ class FieldMethod(ABC):
         count = view.width * view.height
         codes = self.view_codes(geometry_period, appearance_period)
         period = self.nearest_period(geometry_period)
-        images = np.zeros((count, 5), np.float32)
+        parts = []
         for first in range(0, count, _RENDERED_RAYS):
-            pixels = np.arange(first, min(first + _RENDERED_RAYS, count))
+            pixels = torch.arange(first, min(first + _RENDERED_RAYS, count), device=self.device)
             rays = view_rays(view, pixels)
-            middle = np.full(len(pixels), 0.5, np.float32)
-            samples = self.march(rays, np.full(len(pixels), period), middle)
+            middle = torch.full_like(rays.depths, 0.5)
+            samples = self.march(rays, torch.full_like(pixels, period), middle)
             wide = Codes(*(code.expand(len(pixels), -1) for code in codes))
             drawn, reach = self.draw(rays, samples, wide)
-            images[pixels, :3] = drawn.rgb.cpu().numpy()
-            alpha = drawn.opacities.cpu().numpy()
-            images[pixels, 3] = alpha
-            distance = reach.cpu().numpy() / np.maximum(alpha, 1e-9)
-            images[pixels, 4] = np.where(alpha > 0, distance, 0) * rays.depths * self.box.half
-        found = images.reshape(view.height, view.width, 5)
+            seen = drawn.opacities
+            distance = torch.where(seen > 0, reach / seen.clamp_min(1e-9), 0)
+            depth = distance * rays.depths * self.box.half
+            parts.append(torch.cat((drawn.rgb, seen[:, None], depth[:, None]), dim=1))
+        found = torch.cat(parts).cpu().numpy().reshape(view.height, view.width, 5)
         rgb, alpha = found[..., :3].clip(0, 1), found[..., 3].clip(0, 1)
         return Prediction(rgb=rgb.copy(), alpha=alpha.copy(), depth=found[..., 4].copy())
 
@@ -337,7 +332,7 @@ class FieldMethod(ABC):
     def stored(self) -> dict[str, Tensor]:
         """Return the tensors of the model: the field, and a bit for each cell."""
         grids = {
-            f"occupied.{name}": torch.from_numpy(np.packbits(grid))
+            f"occupied.{name}": torch.from_numpy(np.packbits(grid.cpu().numpy()))
             for name, grid in zip(_GRIDS, self.occupancy.grids, strict=True)
         }
         return {**self.network.params, **grids}
@@ -359,7 +354,7 @@ class FieldMethod(ABC):
             grids = {name: tensors.pop(f"occupied.{name}").cpu().numpy() for name in _GRIDS}
             periods = self.meta["num_periods"] if self.geometry_varies else 1
             self.occupancy = Occupancy.restore(
-                periods, self.meta["cells"], self.config.spacing, grids
+                periods, self.meta["cells"], self.config.spacing, grids, device
             )
             self.network = self.network_class(self.config, tensors)
         except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -371,8 +366,8 @@ class FieldMethod(ABC):
         tensors = {f"param.{name}": tensor for name, tensor in self.network.params.items()}
         tensors |= {f"adam.{name}": tensor for name, tensor in self.optimizer.state().items()}
         for i, name in enumerate(_GRIDS):
-            tensors[f"density.{name}"] = torch.from_numpy(self.occupancy.densities[i])
-            tensors[f"grid.{name}"] = torch.from_numpy(self.occupancy.grids[i])
+            tensors[f"density.{name}"] = self.occupancy.densities[i]
+            tensors[f"grid.{name}"] = self.occupancy.grids[i]
         meta = {"method": self.name, "version": self.version, "rays": self.num_rays}
         save_tensors(folder, tensors, meta, stem=TRAINING)
 
@@ -384,8 +379,8 @@ class FieldMethod(ABC):
             self.optimizer.load_state(parts(tensors, "adam"))
             self.num_rays = int(meta["rays"])
             for i, name in enumerate(_GRIDS):
-                self.occupancy.densities[i][:] = tensors[f"density.{name}"].numpy()
-                self.occupancy.grids[i][:] = tensors[f"grid.{name}"].numpy()
+                self.occupancy.densities[i][:] = tensors[f"density.{name}"]
+                self.occupancy.grids[i][:] = tensors[f"grid.{name}"]
         except (KeyError, RuntimeError, ShapeError, ValueError) as error:
             expected = f"a training that {self.name} {self.version} can go on with"
             raise misfit(folder, expected, error) from error

@@ -30,10 +30,22 @@ class Groups(NamedTuple):
     """Group of each row. int32 [N]"""
 
 
-def make_groups(starts: NDArray[np.int64], device: str | torch.device = "cpu") -> Groups:
-    """Make groups of the first row of each, and the number of all rows. [R + 1]"""
-    rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
-    return Groups(torch.from_numpy(starts).to(device), torch.from_numpy(rows).to(device))
+def make_groups(starts: Tensor, rows: int | None = None) -> Groups:
+    """Make groups of the first row of each, and the number of all rows. int64 [R + 1]
+
+    Args:
+        starts: First rows, and the number of all.
+        rows: The number of all, if the host knows it; otherwise it waits for it.
+    """
+    rows = int(starts[-1]) if rows is None else rows
+    numbers = torch.arange(len(starts) - 1, dtype=torch.int32, device=starts.device)
+    return Groups(starts, torch.repeat_interleave(numbers, starts.diff(), output_size=rows))
+
+
+def equal_groups(rows: int, size: int, device: str | torch.device) -> Groups:
+    """Make groups of so many rows each, the last one of fewer."""
+    starts = torch.arange(0, rows + size, size, device=device).clamp_max(rows)
+    return make_groups(starts, rows)
 
 
 def mlp_reference(
@@ -63,7 +75,7 @@ def mlp(
     Returns:
         Outputs. [N, O]
     """
-    check_shape("x", x, (int(groups.starts[-1]), None))
+    check_shape("x", x, (len(groups.of_row), None))
     check_shape("shared", shared, (len(groups.starts) - 1, None))
     check_shape("first layer", layers[0], (None, x.shape[1] + shared.shape[1]))
     if devices.has_kernels(x, shared, *layers):

@@ -12,6 +12,7 @@ from chronoscene.fields.compositing import truncated_exp
 from chronoscene.fields.config import FieldConfig
 from chronoscene.fields.grid import encode
 from chronoscene.fields.mlp import Activation, Groups, initial_layers, mlp
+from chronoscene.training import devices
 from chronoscene.training.spherical_harmonics import basis
 
 DIRECTION_DEGREE = 3
@@ -115,7 +116,7 @@ def frequency_code(x: Tensor, count: int) -> Tensor:
     """
     factors = 2.0 ** torch.arange(count, device=x.device, dtype=x.dtype) * torch.pi
     angles = (x[:, None, :] * factors[:, None]).flatten(1)
-    if x.is_cuda:
+    if not devices.has_kernels(x):
         return torch.cat((x, angles.sin(), angles.cos()), dim=1)
     # NumPy makes one pass, where torch may take another path at the end of a thread's share.
     waves = [torch.from_numpy(wave(angles.numpy())) for wave in (np.sin, np.cos)]

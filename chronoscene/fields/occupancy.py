@@ -11,15 +11,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
+from torch import Tensor
 
 from chronoscene.fields.box import SceneBox
 from chronoscene.fields.marching import march
 from chronoscene.fields.rays import PixelPool
 from chronoscene.methods import TrainingSet
+from chronoscene.training import devices
 
-Density = Callable[[NDArray[np.float32], int], NDArray[np.float32]]
+Density = Callable[[Tensor, int], Tensor]
 """Function that gives densities at contracted places [N, 3] in a period. [N]"""
 
 INTERVAL = 16
@@ -42,30 +45,45 @@ class Occupancy:
         cells: Cells along an edge of the cube.
         spacing: Distance of samples, as a share of a cell.
         allowed: Cells of the cube that may be occupied. [G, G, G]
+        device: Device of all.
     """
 
     def __init__(
-        self, num_periods: int, cells: int, spacing: float, allowed: NDArray[np.bool_]
+        self,
+        num_periods: int,
+        cells: int,
+        spacing: float,
+        allowed: NDArray[np.bool_],
+        device: str = "cpu",
     ) -> None:
         self.step = spacing * 2 / cells
         """Distance of samples, in half edges of the cube."""
         masks = allowed, np.ones((_OUTER_CELLS,) * 3, bool)
-        self._cells = tuple(np.argwhere(mask).astype(np.int32) for mask in masks)
-        self.densities = tuple(np.zeros((num_periods, *mask.shape), np.float32) for mask in masks)
+        self._cells = tuple(
+            devices.to_device(np.argwhere(mask).astype(np.int32), device) for mask in masks
+        )
+        shapes = [(num_periods, *mask.shape) for mask in masks]
+        self.densities = tuple(torch.zeros(shape, device=device) for shape in shapes)
         """Largest density found lately. [T, G, G, G] each"""
         self.grids = tuple(
-            np.repeat(mask[None].astype(np.uint8), num_periods, axis=0) for mask in masks
+            devices.to_device(np.repeat(mask[None].astype(np.uint8), num_periods, axis=0), device)
+            for mask in masks
         )
         """Occupied cells of the cube, and of the contracted unit cube. [T, G, G, G] each"""
 
     @classmethod
     def restore(
-        cls, num_periods: int, cells: int, spacing: float, packed: Mapping[str, NDArray[np.uint8]]
+        cls,
+        num_periods: int,
+        cells: int,
+        spacing: float,
+        packed: Mapping[str, NDArray[np.uint8]],
+        device: str = "cpu",
     ) -> Occupancy:
         """Return the occupancy of a finished model, from the bits of `grids`."""
-        found = cls(num_periods, cells, spacing, np.zeros((cells,) * 3, bool))
+        found = cls(num_periods, cells, spacing, np.zeros((cells,) * 3, bool), device)
         for grid, bits in zip(found.grids, packed.values(), strict=True):
-            grid.reshape(-1)[:] = np.unpackbits(bits, count=grid.size)
+            grid.view(-1)[:] = torch.from_numpy(np.unpackbits(bits, count=grid.numel()))
         return found
 
     def extend(self, num_periods: int) -> None:
@@ -84,29 +102,44 @@ class Occupancy:
         """
         for outer, (cells, grid) in enumerate(zip(self._cells, self.densities, strict=True)):
             limit = _OPACITY / (_OUTER_STEP if outer else self.step)
+            x, y, z = cells.long().unbind(1)
+            numbers = (x * grid.shape[1] + y) * grid.shape[1] + z
             for period in range(len(grid)):
-                chosen = cells[int(generator.integers(_SHARE)) :: _SHARE]
-                places = _places(chosen, generator, grid.shape[1], contracted=bool(outer))
-                at = (period, *chosen.T)
-                grid[at] = np.maximum(_DECAY * grid[at], density(places, period))
+                part = slice(int(generator.integers(_SHARE)), None, _SHARE)
+                places = _places(cells[part], generator, grid.shape[1], contracted=bool(outer))
+                flat, at = grid[period].view(-1), numbers[part]
+                flat[at] = torch.maximum(_DECAY * flat[at], density(places, period))
                 if index >= _WARM_UP:
-                    found = grid[(period, *cells.T)]
-                    occupied = found > min(float(found.mean()), limit)
-                    self.grids[outer][(period, *cells.T)] = occupied
+                    found = flat[numbers]
+                    occupied = found > _mean(found).clamp_max(limit)
+                    self.grids[outer][period].view(-1)[numbers] = occupied.to(torch.uint8)
+
+
+def _mean(x: Tensor) -> Tensor:
+    if devices.has_kernels(x):  # NumPy's sum does not depend on the number of threads
+        return torch.from_numpy(x.numpy().mean(keepdims=True))
+    return x.mean()
 
 
 def _places(
-    cells: NDArray[np.int32], generator: np.random.Generator, count: int, *, contracted: bool
-) -> NDArray[np.float32]:
+    cells: Tensor, generator: np.random.Generator, count: int, *, contracted: bool
+) -> Tensor:
     """Random contracted places in cells."""
-    unit = (cells + generator.random(cells.shape, np.float32)) / np.float32(count)
+    random = devices.uniform(generator, (len(cells), 3), cells)
+    unit = (cells.double() + random) / count
     # The cube is the middle of the contracted one.
     places = unit if contracted else 0.25 + 0.5 * unit
-    return np.minimum(places, np.float32(0.99999)).astype(np.float32)
+    return places.clamp_max(float(np.float32(0.99999))).float()
 
 
 def start_occupancy(
-    train: TrainingSet, box: SceneBox, pool: PixelPool, num_periods: int, cells: int, spacing: float
+    train: TrainingSet,
+    box: SceneBox,
+    pool: PixelPool,
+    num_periods: int,
+    cells: int,
+    spacing: float,
+    device: str = "cpu",
 ) -> Occupancy:
     """Begin with the cells of sparse points, dilated as long as that reaches more of the photos.
 
@@ -114,21 +147,22 @@ def start_occupancy(
     it while it stops a further half per cent of them.
     """
     allowed = np.zeros((cells,) * 3, bool)
-    at = np.floor((box.to_cube(train.points) + 1) * cells / 2).astype(np.int64)
+    points = box.to_cube(torch.from_numpy(train.points)).numpy()
+    at = np.floor((points + 1) * cells / 2).astype(np.int64)
     at = at[((at >= 0) & (at < cells)).all(axis=1)]
     if len(at) == 0 or len(pool) == 0:
-        return Occupancy(num_periods, cells, spacing, np.ones_like(allowed))
+        return Occupancy(num_periods, cells, spacing, np.ones_like(allowed), device)
     allowed[tuple(at.T)] = True
     rays = pool.draw(np.random.default_rng(0), 4096)
     origins, reached = box.to_cube(rays.origins), 0.0
-    outer = np.zeros((1, 1, 1, 1), np.uint8)
+    outer = torch.zeros(1, 1, 1, 1, dtype=torch.uint8, device=device)
+    nothing = torch.zeros_like(rays.views), torch.zeros_like(rays.depths)
     for _ in range(_MOST_DILATIONS):
         allowed = binary_dilation(allowed, np.ones((3, 3, 3), bool))
-        grids = allowed[None].astype(np.uint8), outer
-        nothing = np.zeros(len(origins), np.int64), np.zeros(len(origins), np.float32)
+        grids = devices.to_device(allowed[None].astype(np.uint8), device), outer
         samples = march(origins, rays.directions, *nothing, grids, box, spacing * 2 / cells, 0)
-        share = float((np.diff(samples.starts) > 0).mean())
+        share = float((samples.groups.starts.diff() > 0).double().mean())
         if share < reached + _GAIN:
             break
         reached = share
-    return Occupancy(num_periods, cells, spacing, allowed)
+    return Occupancy(num_periods, cells, spacing, allowed, device)

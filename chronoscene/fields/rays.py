@@ -6,11 +6,14 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from chronoscene.methods import TrainingView, View
 from chronoscene.methods.interface import no_mask, nothing_ahead
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.training import devices
 
 MOST_PIXELS = 1 << 26
 """Pixels held at most: half a gigabyte. Of more, each photo gives a random part."""
@@ -19,17 +22,17 @@ MOST_PIXELS = 1 << 26
 class Rays(NamedTuple):
     """Rays in the training frame, and what they show."""
 
-    origins: NDArray[np.float64]
-    """[R, 3]"""
-    directions: NDArray[np.float32]
+    origins: Tensor
+    """float64 [R, 3]"""
+    directions: Tensor
     """Unit vectors. [R, 3]"""
-    depths: NDArray[np.float32]
+    depths: Tensor
     """z-depth of the place at distance 1. [R]"""
-    views: NDArray[np.int64]
-    """Number of the view of each ray in its pool. [R]"""
-    colors: NDArray[np.float32]
+    views: Tensor
+    """Number of the view of each ray in its pool. int64 [R]"""
+    colors: Tensor
     """0..1. [R, 3]"""
-    pixels: NDArray[np.float32]
+    pixels: Tensor
     """Place in the image, 0..1. [R, 2]"""
 
 
@@ -39,20 +42,30 @@ def _pixel_to_world(view: View) -> NDArray[np.float64]:
     return found
 
 
-def _unit(directions: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-    return (directions / lengths).astype(np.float32), (1 / lengths[:, 0]).astype(np.float32)
+def _unit(directions: Tensor) -> tuple[Tensor, Tensor]:
+    x, y, z = directions.unbind(1)
+    lengths = torch.sqrt(x * x + y * y + z * z)
+    return (directions / lengths[:, None]).float(), (1 / lengths).float()
 
 
-def view_rays(view: View, pixels: NDArray[np.int64]) -> Rays:
+def _on_image(pixels: Tensor, width: Tensor | int) -> tuple[Tensor, Tensor, Tensor]:
+    """Places (u, v, 1) of pixels that are numbered row by row. float64 [R] each"""
+    u, v = (x.double() + 0.5 for x in (pixels % width, pixels // width))
+    return u, v, torch.ones_like(u)
+
+
+def view_rays(view: View, pixels: Tensor) -> Rays:
     """Return rays through pixels of a view, numbered row by row; their colours are zero."""
-    rows, columns = np.divmod(pixels, view.width)
-    image = np.stack([columns + 0.5, rows + 0.5, np.ones(len(pixels))], axis=1)
-    directions, depths = _unit(image @ _pixel_to_world(view).T)
-    origins = np.broadcast_to(camera_centre(view.cam_from_world), (len(pixels), 3))
-    nothing = np.zeros(len(pixels), np.int64), np.zeros((len(pixels), 3), np.float32)
-    places = (image[:, :2] / [view.width, view.height]).astype(np.float32)
-    return Rays(origins, directions, depths, *nothing, places)
+    u, v, one = _on_image(pixels, view.width)
+    image, matrix = torch.stack((u, v, one), dim=1), _pixel_to_world(view)
+    places = torch.stack((u / view.width, v / view.height), dim=1).float()
+    if devices.has_kernels(places):
+        turned = torch.from_numpy(image.numpy() @ matrix.T)
+    else:
+        turned = image @ devices.to_device(matrix, pixels.device).T
+    centre = devices.to_device(camera_centre(view.cam_from_world), pixels.device)
+    nothing = torch.zeros_like(pixels), places.new_zeros(len(pixels), 3)
+    return Rays(centre.expand(len(pixels), 3), *_unit(turned), *nothing, places)
 
 
 class PixelPool:
@@ -64,6 +77,7 @@ class PixelPool:
         load_mask: As `TrainingSet.load_mask`.
         expect: As `TrainingSet.expect`.
         seed: Of the choice, if there are too many.
+        device: Device of the pixels.
     """
 
     def __init__(
@@ -74,6 +88,7 @@ class PixelPool:
         *,
         expect: Callable[[Sequence[int]], None] = nothing_ahead,
         seed: int = 0,
+        device: str = "cpu",
     ) -> None:
         self.views = tuple(views)
         most = MOST_PIXELS // max(len(views), 1)
@@ -92,12 +107,15 @@ class PixelPool:
         self.counts = np.array([len(chosen) for chosen in pixels])
         """Pixels of each view. [V]"""
         self.ends = np.cumsum(self.counts)
-        self._pixels = np.concatenate(pixels)
-        self._colors = np.concatenate(colors)
-        self._sizes = np.array([(view.width, view.height) for view in self.views])
-        self._matrices = np.stack([_pixel_to_world(view) for view in self.views])
-        self._centres = np.stack([camera_centre(view.cam_from_world) for view in self.views])
-        self.periods = np.array([view.period for view in self.views], np.int64)
+        sizes = np.array([(view.width, view.height) for view in self.views])
+        matrices = np.stack([_pixel_to_world(view) for view in self.views])
+        centres = np.stack([camera_centre(view.cam_from_world) for view in self.views])
+        arrays = self.ends, np.concatenate(pixels), np.concatenate(colors), sizes, matrices, centres
+        self._ends, self._pixels, self._colors, self._sizes, self._matrices, self._centres = (
+            devices.to_device(array, device) for array in arrays
+        )
+        periods = np.array([view.period for view in self.views], np.int64)
+        self.periods = devices.to_device(periods, device)
         """Period of each view. [V]"""
 
     def __len__(self) -> int:
@@ -108,15 +126,21 @@ class PixelPool:
     ) -> Rays:
         """Draw rays of all views, or ``of`` some by their numbers, with replacement."""
         if of is None:
-            chosen = generator.integers(len(self), size=count)
+            chosen = devices.integers(generator, len(self), count, self._pixels)
         else:
             ends = np.cumsum(self.counts[of])
-            chosen = generator.integers(ends[-1], size=count)
-            chosen += (self.ends[of] - ends)[np.searchsorted(ends, chosen, side="right")]
-        views = np.searchsorted(self.ends, chosen, side="right")
-        rows, columns = np.divmod(self._pixels[chosen], self._sizes[views, 0])
-        image = np.stack([columns + 0.5, rows + 0.5, np.ones(count)], axis=1)
-        directions, depths = _unit(np.einsum("rij,rj->ri", self._matrices[views], image))
-        colors = self._colors[chosen].astype(np.float32) / np.float32(255)
-        places = (image[:, :2] / self._sizes[views]).astype(np.float32)
-        return Rays(self._centres[views], directions, depths, views, colors, places)
+            chosen = devices.integers(generator, int(ends[-1]), count, self._pixels)
+            of_some, moves = (
+                devices.to_device(x, chosen.device) for x in (ends, self.ends[of] - ends)
+            )
+            chosen = chosen + moves[torch.searchsorted(of_some, chosen, right=True)]
+        views = torch.searchsorted(self._ends, chosen, right=True)
+        sizes, matrices = self._sizes[views], self._matrices[views]
+        image = torch.stack(_on_image(self._pixels[chosen], sizes[:, 0]), dim=1)
+        colors = self._colors[chosen].float() / 255
+        if devices.has_kernels(colors):
+            turned = torch.from_numpy(np.einsum("rij,rj->ri", matrices.numpy(), image.numpy()))
+        else:
+            turned = torch.einsum("rij,rj->ri", matrices, image)
+        places = (image[:, :2] / sizes).float()
+        return Rays(self._centres[views], *_unit(turned), views, colors, places)

@@ -10,24 +10,25 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from chronoscene.fields.mlp import Groups
 from chronoscene.kernels.compilation import kernel
 from chronoscene.training import devices
 
 _BLOCK = 64  # Groups per task
 
 
-def part_rows(x: Tensor, first: NDArray[np.int64], starts: NDArray[np.int64]) -> Tensor:
+def part_rows(x: Tensor, first: Tensor, groups: Groups) -> Tensor:
     """Return some rows of each group, compiled for float32 on a CPU.
 
     Args:
         x: Rows. [N, ...]
-        first: First row that is taken of each group; no row is taken twice. [R]
-        starts: First row of each group in the result, and the number of all. [R + 1]
+        first: First row that is taken of each group; no row is taken twice. int64 [R]
+        groups: Groups of the result.
     """
     if devices.has_kernels(x):
-        return _PartRows.apply(x, first, starts)
-    rows = np.repeat(first - starts[:-1], np.diff(starts)) + np.arange(starts[-1])
-    return x.index_select(0, devices.to_device(rows, x.device))
+        return _PartRows.apply(x, first.numpy(), groups.starts.numpy())
+    moved = (first - groups.starts[:-1]).index_select(0, groups.of_row)
+    return x.index_select(0, moved + torch.arange(len(moved), device=x.device))
 
 
 class _PartRows(torch.autograd.Function):

@@ -32,6 +32,14 @@ def uniform(generator: np.random.Generator, shape: tuple[int, ...], like: Tensor
     return torch.from_numpy(generator.random(shape, np.float32))
 
 
+def integers(generator: np.random.Generator, high: int, count: int, like: Tensor) -> Tensor:
+    """Draw random numbers 0..high - 1 on the device of a tensor. int64 [count]"""
+    if like.is_cuda:
+        drawn = _on_gpu(generator, like)
+        return torch.randint(high, (count,), generator=drawn, device=like.device)
+    return torch.from_numpy(generator.integers(high, size=count))
+
+
 def normal(generator: np.random.Generator, shape: tuple[int, ...], like: Tensor) -> Tensor:
     """Draw normal random numbers on the device of a tensor. float64"""
     if like.is_cuda:

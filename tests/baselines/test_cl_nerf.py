@@ -39,7 +39,7 @@ def extended(steps: int = 2, **options: Any) -> Any:
 def field_at(method: Any, period: float) -> tuple[torch.Tensor, ...]:
     """Densities and colours at some places."""
     places = torch.rand(64, 3, generator=torch.Generator().manual_seed(0)) * 0.9
-    groups, codes = make_groups(np.array([0, 64])), method.view_codes(period, period)
+    groups, codes = make_groups(torch.tensor([0, 64])), method.view_codes(period, period)
     with torch.no_grad():
         densities, features = method.network.density(places, groups, codes.geometry)
         direction = torch.tensor([[0.0, 0.0, 1.0]])
@@ -59,7 +59,7 @@ def test_what_is_known_of_earlier_periods_keeps_its_bits() -> None:
 def test_the_adaptors_of_a_period_are_those_up_to_it() -> None:
     method = extended()
     method.extend(THIRD)
-    gates = method.gates(np.array([0.0, 0.25, 1.0, 1.5, 2.0]))
+    gates = method.gates(torch.tensor([0.0, 0.25, 1.0, 1.5, 2.0]))
     assert gates.tolist() == [[0, 0], [0.25, 0], [1, 0], [1, 0.5], [1, 1]]
     names = {name for name in method.network.params if name.startswith("table")}
     assert names == {"table", "table_1", "table_2"}
@@ -85,9 +85,9 @@ def test_replay_gives_way_where_something_has_changed(change: float, kept: float
     rays = method.pool.draw(np.random.default_rng(0), 64)
     values = torch.cat((torch.zeros(64, 3), torch.full((64, 1), change)), dim=1)
     drawn = Drawn(values, torch.ones(64), method.background)
-    old = torch.from_numpy(rays.views < method.replayed)[:, None]
+    old = (rays.views < method.replayed)[:, None]
     assert 10 < int(old.sum()) < 54
-    squares = torch.from_numpy(rays.colors).square()
+    squares = rays.colors.square()
     expected = float(torch.where(old, kept * squares, squares).mean())
     assert float(method.loss(drawn, rays, 0.0)) == pytest.approx(expected, rel=1e-5)
 

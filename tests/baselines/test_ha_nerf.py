@@ -61,7 +61,7 @@ def test_what_a_mask_ignores_is_grey_for_the_encoder() -> None:
 
 
 def test_the_light_of_a_view_is_the_mean_of_its_periods_photos(trained: Any) -> None:
-    own = np.array([i for i, view in enumerate(trained.pool.views) if view.period == 1])
+    own = torch.tensor([i for i, view in enumerate(trained.pool.views) if view.period == 1])
     codes = trained.lights(own).detach()
     found = trained.view_codes(0.0, 1.0).color
     torch.testing.assert_close(found, codes.mean(0, keepdim=True))
@@ -89,8 +89,7 @@ def test_a_step_draws_rays_of_a_few_photos(trained: Any) -> None:
     rays = trained.draw_rays(np.random.default_rng(0))
     assert len(np.unique(rays.views)) == 4
     view = trained.pool.views[0]
-    at = np.rint(rays.pixels * [view.width, view.height] - 0.5)
-    column, row = at[0].astype(int)
+    column, row = np.rint(rays.pixels[0].numpy() * [view.width, view.height] - 0.5).astype(int)
     image = make_training_set(3).load_image(int(rays.views[0]))
     np.testing.assert_allclose(rays.colors[0], image[row, column] / 255, atol=1e-6)
 

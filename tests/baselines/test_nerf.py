@@ -50,11 +50,11 @@ def test_geometry_is_the_same_at_all_times(neusc: Any) -> None:
 
 def test_a_step_between_two_periods_alters_the_later_ones_alone(neusc: Any) -> None:
     centres = neusc.network.params["step_centres"]
-    before = neusc.time_code(neusc.times(np.arange(3))).detach().clone()
+    before = neusc.time_code(neusc.times(torch.arange(3))).detach().clone()
     with torch.no_grad():
         old = centres[0].clone()
         centres[0] = 0.7 if before[2, 0] and old < 0.7 else 0.3
-        after = neusc.time_code(neusc.times(np.arange(3)))
+        after = neusc.time_code(neusc.times(torch.arange(3)))
         centres[0] = old
     assert torch.equal(after[:, 1:], before[:, 1:])
     assert after[0, 0] == 0
@@ -63,14 +63,14 @@ def test_a_step_between_two_periods_alters_the_later_ones_alone(neusc: Any) -> N
 
 def test_content_switches_between_periods(neusc: Any) -> None:
     """The time code of a fractional period is that of one side; there are no shares."""
-    code = neusc.time_code(neusc.times(np.linspace(0, 2, 21))).detach()
+    code = neusc.time_code(neusc.times(torch.linspace(0, 2, 21))).detach()
     assert set(code.unique().tolist()) <= {0.0, 1.0}
 
 
 def test_light_is_applied_after_the_content(neusc: Any) -> None:
     """Another light changes what is seen, and neither the content nor the density."""
     network, groups_of = neusc.network, import_object("chronoscene.fields.mlp:make_groups")
-    places, groups = torch.rand(6, 3), groups_of(np.array([0, 6]))
+    places, groups = torch.rand(6, 3), groups_of(torch.tensor([0, 6]))
     _, features = network.density(places, groups, torch.zeros(1, 0))
     color = neusc.view_codes(0.0, 0.0).color
     other = color.clone()

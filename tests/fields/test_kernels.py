@@ -21,6 +21,7 @@ from chronoscene.fields.grid import GridLayout, encode, encode_reference
 from chronoscene.fields.mlp import Groups, initial_layers, make_groups, mlp, mlp_reference
 from chronoscene.fields.rows import part_rows
 from chronoscene.kernels.runtime import set_threads
+from chronoscene.training import devices
 
 LAYOUT = GridLayout(levels=4, log2_rows=10, base=4, finest=40)
 
@@ -52,7 +53,7 @@ def assert_like_reference(
 
 
 def some_groups(counts: Sequence[int]) -> Groups:
-    return make_groups(np.concatenate(([0], np.cumsum(counts))).astype(np.int64))
+    return make_groups(torch.tensor([0, *np.cumsum(counts)]))
 
 
 def test_grid() -> None:
@@ -122,12 +123,26 @@ def test_composite() -> None:
     assert_like_reference(both(composite), both(composite_reference), [densities, values])
 
 
+def test_plain_torch_tells_the_samples_of_a_ray_apart_behind_many_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In float32, what rays before have summed up would swallow the ray's own depths."""
+    groups = some_groups([1_000, 20])
+    densities = torch.cat((torch.full((1_000,), 1e6), torch.full((20,), 1.0)))
+    values, lengths = torch.linspace(0, 1, 1_020)[:, None], torch.full((1_020,), 0.1)
+    expected = composite(densities, values, lengths, groups)
+    monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
+    assert visible(densities, lengths, groups).starts.tolist() == [0, 1, 21]
+    for found, exact in zip(composite(densities, values, lengths, groups), expected, strict=True):
+        torch.testing.assert_close(found, exact, rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_samples_added_in_parts_are_like_all_at_once(dtype: torch.dtype) -> None:
     """With kernels to the bit: a render shows what a training sees."""
     generator = torch.Generator().manual_seed(5)
     groups = some_groups([9, 0, 40, 17] * 30)
-    starts, count = groups.starts.numpy(), int(groups.starts[-1])
+    starts, count = groups.starts, int(groups.starts[-1])
     densities = torch.rand(count, generator=generator, dtype=dtype) * 60
     lengths = torch.rand(count, generator=generator, dtype=dtype) * 0.02
     values = torch.rand(count, 3, generator=generator, dtype=dtype)
@@ -137,11 +152,10 @@ def test_samples_added_in_parts_are_like_all_at_once(dtype: torch.dtype) -> None
     if dtype == torch.float64:
         front.clear = front.clear.double()
     while done < 40:
-        going = np.flatnonzero(np.diff(starts) > done)
-        taken = np.minimum(np.diff(starts)[going] - done, 7)
-        ends = np.concatenate(([0], np.cumsum(taken)))
-        parts = (part_rows(x, starts[going] + done, ends) for x in (densities, values, lengths))
-        front.add(torch.from_numpy(going), *parts, make_groups(ends))
+        going = torch.nonzero(starts.diff() > done)[:, 0]
+        part = some_groups((starts.diff()[going] - done).clamp_max(7).tolist())
+        parts = (part_rows(x, starts[going] + done, part) for x in (densities, values, lengths))
+        front.add(going, *parts, part)
         done += 7
     exact = {"rtol": 0, "atol": 0} if dtype == torch.float32 else {}
     torch.testing.assert_close(front.sums, sums, **exact)
@@ -150,21 +164,22 @@ def test_samples_added_in_parts_are_like_all_at_once(dtype: torch.dtype) -> None
 
 def test_what_is_visible_depends_on_what_is_in_front() -> None:
     groups, depths = some_groups([3, 3]), torch.full((6,), 5.0)
-    ends = visible(depths, torch.ones(6), groups)
-    assert ends.tolist() == [0, 2, 4]  # exp(-5) is above the limit, exp(-10) below
-    ends = visible(depths, torch.ones(6), groups, torch.tensor([1e-3, 1e-5]))
-    assert ends.tolist() == [0, 1, 1]
+    found = visible(depths, torch.ones(6), groups)
+    assert found.starts.tolist() == [0, 2, 4]  # exp(-5) is above the limit, exp(-10) below
+    assert found.of_row.tolist() == [0, 0, 1, 1]
+    found = visible(depths, torch.ones(6), groups, torch.tensor([1e-3, 1e-5]))
+    assert found.starts.tolist() == [0, 1, 1]
 
 
 def test_parts_of_groups() -> None:
-    first, starts = np.array([2, 5, 9]), np.array([0, 3, 3, 70])
+    first, groups = torch.tensor([2, 5, 9]), some_groups([3, 0, 67])
     x = torch.randn(80, 5, generator=torch.Generator().manual_seed(6))
     chosen = torch.tensor([2, 3, 4, *range(9, 76)])
     assert_like_reference(
-        lambda x: part_rows(x, first, starts), lambda x: x.index_select(0, chosen), [x]
+        lambda x: part_rows(x, first, groups), lambda x: x.index_select(0, chosen), [x]
     )
-    assert torch.equal(part_rows(x[:, 0], first, starts), x[chosen, 0])
-    assert torch.equal(part_rows(x.double(), first, starts), x.double()[chosen])
+    assert torch.equal(part_rows(x[:, 0], first, groups), x[chosen, 0])
+    assert torch.equal(part_rows(x.double(), first, groups), x.double()[chosen])
 
 
 def test_gradients_of_the_definitions() -> None:

@@ -152,8 +152,8 @@ def test_replayed_rays_weigh_more_and_more_in_meil_nerf() -> None:
     rays = method.pool.draw(np.random.default_rng(0), 64)
     values = torch.zeros(64, 3)
     drawn = Drawn(values, torch.ones(64), method.background)
-    squares = torch.from_numpy(rays.colors).square()
-    old = torch.from_numpy(rays.views < len(first.views))[:, None]
+    squares = rays.colors.square()
+    old = (rays.views < len(first.views))[:, None]
     assert 10 < int(old.sum()) < 54
     for progress, weight in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
         expected = torch.where(old, weight * torch.sqrt(squares + 1e-6), squares).mean()
@@ -177,12 +177,12 @@ def test_each_photo_is_kept_with_equal_probability() -> None:
 
 def test_rays_meet_their_pixels() -> None:
     view = make_training_set(1).views[2]
-    rays = view_rays(view, np.array([0, 3 * view.width + 7]))
-    place = rays.origins[1] + 0.8 * rays.directions[1]
+    rays = view_rays(view, torch.tensor([0, 3 * view.width + 7]))
+    place = (rays.origins[1] + 0.8 * rays.directions[1]).numpy()
     inside = view.cam_from_world[:3, :3] @ place + view.cam_from_world[:3, 3]
     u, v, z = view.K @ inside
     assert (u / z, v / z) == pytest.approx((7.5, 3.5), abs=1e-4)
-    assert z == pytest.approx(0.8 * rays.depths[1], rel=1e-5)
+    assert z == pytest.approx(0.8 * float(rays.depths[1]), rel=1e-5)
 
 
 def test_contraction_keeps_the_cube_and_reaches_everything() -> None:
@@ -198,19 +198,18 @@ def test_occupancy_begins_where_points_are() -> None:
     data = make_training_set(1)
     box, pool = box_of(data), PixelPool(data.views, data.load_image)
     occupancy = start_occupancy(data, box, pool, 1, 32, 0.3)
-    cells = np.floor((box.to_cube(data.points) + 1) * 16).astype(int).clip(0, 31)
-    assert occupancy.grids[0][0][tuple(cells.T)].mean() > 0.97
-    assert occupancy.grids[0].mean() < 1
+    cells = ((box.to_cube(torch.from_numpy(data.points)) + 1) * 16).long().clamp(0, 31)
+    assert occupancy.grids[0][0][tuple(cells.T)].double().mean() > 0.97
+    assert occupancy.grids[0].double().mean() < 1
 
 
 def test_a_far_place_is_rendered_behind_the_box() -> None:
     """Behind everything there are samples, so that no ray is without a colour to learn."""
     method = begun("clnerf", make_training_set(1))
     view = make_training_set(1).views[0]
-    rays = view_rays(view, np.arange(4))
-    periods, middle = np.zeros(4, np.int64), np.full(4, 0.5, np.float32)
-    samples = method.march(rays, periods, middle)
-    ends = samples.starts[1:] - 1
+    rays = view_rays(view, torch.arange(4))
+    samples = method.march(rays, torch.zeros_like(rays.views), torch.full((4,), 0.5))
+    ends = samples.groups.starts[1:] - 1
     assert (samples.distances[ends] > 5).all()
     assert ((samples.places >= 0) & (samples.places < 1)).all()
 
@@ -230,8 +229,8 @@ def test_what_is_hidden_is_not_evaluated_in_renders(
         return found * float(np.exp(shift)), features
 
     monkeypatch.setattr(network, "density", counted)
-    rays = view_rays(make_training_set(1).views[0], np.arange(200))
-    samples = method.march(rays, np.zeros(200, np.int64), np.full(200, 0.5, np.float32))
+    rays = view_rays(make_training_set(1).views[0], torch.arange(200))
+    samples = method.march(rays, torch.zeros_like(rays.views), torch.full((200,), 0.5))
     codes = method.codes(rays)
     trained, far = method.draw(rays, samples, codes)
     assert count == len(samples.lengths)
@@ -269,5 +268,5 @@ def test_uncertainty_of_one_leaves_the_squared_error() -> None:
     values = torch.cat((torch.rand(5, 3), torch.zeros(5, 2)), dim=1)
     drawn = Drawn(values, torch.ones(5), method.background)
     rays = method.pool.draw(np.random.default_rng(0), 5)
-    error = (drawn.rgb - torch.from_numpy(rays.colors)).square().mean()
+    error = (drawn.rgb - rays.colors).square().mean()
     assert float(method.loss(drawn, rays, 0.0)) == pytest.approx(float(error / 2 + 3), rel=1e-6)

@@ -11,6 +11,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import torch
 from rounding import raise_eps
 
 from chronoscene.errors import CheckpointError
+from chronoscene.fields.config import FieldConfig
 from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.contract.subject import PAUSE
 from chronoscene.harness.train import painted_balls
@@ -42,7 +44,12 @@ IMAGE_TOLERANCE = {"cpu": 2e-6, "cuda": 1e-3}
 RENDER_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}
 """Of images of one model. Measured on a CPU: 6e-7."""
 QUESTIONS = 3
-"""To tensors in a step: what is in view, what of it is switched on; and how the step went."""
+"""To tensors in a step: what is in view, what of it is switched on; and how the step went. Of
+fields: how many samples there are, how many are seen; and how the step went."""
+MORE_QUESTIONS = {"ha-nerf": 1, "ha-nerf-t": 1}
+"""Which photos have been drawn, and have to be encoded."""
+SMALL_FIELD = {"levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
+"""Fields in plain torch are slow on a CPU."""
 
 
 @dataclass
@@ -57,7 +64,9 @@ class Compiled:
     def method(self, device: str = "cpu") -> Method:
         """At the start of a training with as many options as all methods have."""
         config = tiny_training.small_config(self.spec)
-        options = {"exposure": "image", "random_background": True}
+        options: dict[str, Any] = {"exposure": "image", "random_background": True}
+        if isinstance(config, FieldConfig):
+            options |= SMALL_FIELD
         known = {k: v for k, v in options.items() if hasattr(config, k)}
         method: Method = import_object(self.spec.method)(dataclasses.replace(config, **known))
         method.setup(self.data, seed=0, device=device)
@@ -217,6 +226,8 @@ def test_a_training_of_another_device_goes_on_or_is_refused(
 
 
 def test_a_view_of_nothing_is_an_empty_step(compiled: Compiled, device: str) -> None:
+    if compiled.spec.learns_background:
+        pytest.skip("what is far away is something, too")
     away = np.diag([1.0, 1.0, 1.0, 1.0])
     away[2, 3] = -50.0  # everything far behind
     views = [dataclasses.replace(view, cam_from_world=away) for view in compiled.data.views]
@@ -238,7 +249,8 @@ def test_a_step_asks_a_gpu_little_and_gets_no_table(
     for i in (PAUSE, PAUSE + 1):
         found.clear()
         method.step(i, i / tiny_training.STEPS)
-        assert sum(found.values()) <= QUESTIONS, found
+        allowed = QUESTIONS + MORE_QUESTIONS.get(compiled.spec.name, 0)
+        assert sum(found.values()) <= allowed, found
         assert not found.keys() & {"numpy", "cpu", "tensor", "new_tensor"}, found
 
 

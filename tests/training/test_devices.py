@@ -47,6 +47,19 @@ def test_random_numbers_follow_from_the_generator(device: str, draw) -> None:  #
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
+def test_whole_random_numbers_follow_from_the_generator(device: str) -> None:
+    like = torch.zeros(1, device=device)
+    first, again, other = (
+        devices.integers(np.random.default_rng(seed), 5, 2_000, like) for seed in (0, 0, 1)
+    )
+    assert first.device.type == device and torch.equal(first, again)
+    assert not torch.equal(first, other)
+    # Six standard deviations of the number of draws of one of five.
+    assert (first.bincount(minlength=5) - 400).abs().max() < 6 * (2_000 * 0.2 * 0.8) ** 0.5
+    assert (first.min(), first.max()) == (0, 4)
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
 def test_exponentials(device: str) -> None:
     x = torch.tensor([-200.0, -1.0, 0.0, 1.0, 200.0], device=device)
     expected = x.double().exp().float()
