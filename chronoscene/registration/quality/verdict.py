@@ -67,8 +67,8 @@ THRESHOLDS: dict[str, Threshold] = {
         what="share of the photos of a period that are registered",
         doubtful=0.6, fail=0.1, larger_is_better=True,
         why="measurements say little about a period most of whose photos are missing",
-        todo="registration_log.json says why photos are missing; add photos with viewpoints "
-        "between those of the dates",
+        todo="registration_log.json says why photos are missing; add photos half a step apart "
+        "between them and their neighbours, and with viewpoints between those of the dates",
     ),
     "images": Threshold(
         what="registered images of a period",
