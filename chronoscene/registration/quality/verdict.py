@@ -339,7 +339,7 @@ def _of_period(p: PeriodFigures) -> Iterator[Objection]:
 
 
 def _thin(p: PeriodFigures) -> Iterator[Objection]:
-    """Say what to photograph where photos hardly overlap; no reason for doubt by itself."""
+    """Objection to photos that overlap too little; no reason for doubt by itself."""
     if p.in_three is not None:
         yield from _check("in_three", p.in_three, f"period {p.label}")
 
