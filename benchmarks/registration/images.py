@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageEnhance
 
 from benchmarks.registration import outcomes as shared
+from chronoscene.arrays import Array
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.geodesy import Georeference
@@ -25,8 +26,6 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.synth import SynthSettings, generate
 
 ORIGIN = Georeference(48.1, 11.5, 520.0, "as stated")
-
-WIDTH, HEIGHT = 800, 600
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +46,11 @@ class ImageCase:
     quality: int = 92
     """JPEG."""
     gps: bool = True
+    blocks: int = 2
+    """Of the city, along each axis."""
+    width: int = 800
+    """Pixels."""
+    height: int = 600
     other_place: bool = False
     """True if the last period shows another city, so that nothing can be right. It is mirrored,
     because the textures of all cities are alike."""
@@ -78,14 +82,12 @@ def run_images(options: argparse.Namespace) -> list[shared.Outcome]:
     with shared.work_folder(options.work) as work:
         for case in [c for c in CASES if options.only in c.name][: options.cases]:
             folder = work / case.name.replace(", ", "-").replace(" ", "_")
-            truth = _photos(case, folder)
+            truth = make_photos(case, folder)
             outcomes += [_run_case(case, folder, truth, route) for route in routes]
     return outcomes
 
 
-def _run_case(
-    case: ImageCase, folder: Path, truth: dict[str, NDArray[np.float64]], route: str
-) -> shared.Outcome:
+def _run_case(case: ImageCase, folder: Path, truth: dict[str, Array], route: str) -> shared.Outcome:
     found: list[Inspection] = []
     start, cpu = time.perf_counter(), shared.cpu_seconds()
     try:
@@ -98,7 +100,7 @@ def _run_case(
     except ChronoSceneError as error:
         print(f"{case.name}, {route}: refused: {error}", flush=True)
         return shared.refused(case.name, route, case.periods, shared.cpu_seconds() - cpu)
-    poses = np.stack([truth[Path(name).name] for name in model.names])
+    poses = true_poses(model, truth)
     outcome = shared.judged(
         case.name, route, model, poses, found[-1].verdict, shared.cpu_seconds() - cpu
     )
@@ -127,7 +129,12 @@ def _frozen(folder: Path, found: list[Inspection]) -> Registered:
     return run(captures, out, options, into=read_scene(base), inspected=found.append)
 
 
-def _photos(case: ImageCase, folder: Path) -> dict[str, NDArray[np.float64]]:
+def true_poses(model: Registered, truth: Mapping[str, Array]) -> Array:
+    """Truth of the images of a model, by the names of their photos. [N, 4, 4]"""
+    return np.stack([truth[Path(name).name] for name in model.names])
+
+
+def make_photos(case: ImageCase, folder: Path) -> dict[str, Array]:
     """Write photos by period with noisy GPS in EXIF; the true pose of each, by its file's name."""
     scenes = [_render(case, folder / "scene", case.seed)]
     if case.other_place:
@@ -155,14 +162,14 @@ def _photos(case: ImageCase, folder: Path) -> dict[str, NDArray[np.float64]]:
 def _render(case: ImageCase, folder: Path, seed: int) -> Scene:
     if not (folder / "sparse").is_dir():
         settings = SynthSettings(
-            kind=case.kind, periods=case.periods, width=WIDTH, height=HEIGHT, views=case.views,
-            points=2000, blocks=2, seed=seed, rebuilt=case.rebuilt,
+            kind=case.kind, periods=case.periods, width=case.width, height=case.height,
+            views=case.views, points=2000, blocks=case.blocks, seed=seed, rebuilt=case.rebuilt,
         )  # fmt: skip
         generate(folder, settings)
     return read_scene(folder)
 
 
-def _noisy(rng: np.random.Generator, centres: NDArray[np.float64]) -> NDArray[np.float64]:
+def _noisy(rng: np.random.Generator, centres: Array) -> Array:
     """GPS with 3 m of noise and one position in ten 30 to 300 m off. [N, 3]"""
     far = rng.normal(size=centres.shape)
     far *= rng.uniform(30, 300, (len(far), 1)) / np.linalg.norm(far, axis=1, keepdims=True)
@@ -171,7 +178,7 @@ def _noisy(rng: np.random.Generator, centres: NDArray[np.float64]) -> NDArray[np
 
 
 def _write(
-    case: ImageCase, source: Path, target: Path, period: int, place: NDArray[np.float64] | None,
+    case: ImageCase, source: Path, target: Path, period: int, place: Array | None,
     *, mirror: bool,
 ) -> None:  # fmt: skip
     with Image.open(source) as image:

@@ -150,12 +150,34 @@ def similar_pairs(descriptors: NDArray[np.float32], periods: Ints) -> set[Pair]:
 
 
 def global_descriptors(database: str | Path, names: Sequence[str]) -> NDArray[np.float32]:
-    """Global descriptors of images, unit length, zero without features. [N, WORDS * D]"""
-    local = [_local(database, name) for name in names]
-    columns = max(found.shape[1] for found in local)
-    local = [f if f.shape[1] == columns else np.zeros((0, columns), np.float32) for f in local]
-    words = visual_words(np.concatenate(local))
+    """Global descriptors of images, unit length, zero without features. [N, WORDS * D]
+
+    Descriptors are read anew for each use: those of thousands of photos fill gigabytes.
+    """
+    shapes = [_local(database, name).shape for name in names]
+    columns = max(width for _, width in shapes)
+    ends = np.cumsum([count if width == columns else 0 for count, width in shapes])
+    rng = np.random.default_rng(0)
+    rows = training_rows(int(ends[-1]), rng)
+    training = np.zeros((len(rows), columns), np.float32)
+    for name, end, (count, width) in zip(names, ends, shapes, strict=True):
+        mine = (rows >= end - count) & (rows < end)
+        if width == columns and mine.any():
+            training[mine] = _local(database, name)[rows[mine] - (end - count)]
+    words = visual_words(training, rng)
+    nothing = np.zeros((0, columns), np.float32)
+    local = (
+        _local(database, name) if width == columns else nothing
+        for name, (_, width) in zip(names, shapes, strict=True)
+    )
     return np.stack([vlad(descriptors, words) for descriptors in local])
+
+
+def training_rows(count: int, rng: np.random.Generator) -> Ints:
+    """Rows of descriptors by which words are learnt: all, or a sample of many."""
+    if count <= MAX_TRAINING:
+        return np.arange(count)
+    return rng.choice(count, MAX_TRAINING, replace=False)
 
 
 def _local(database: str | Path, name: str) -> NDArray[np.float32]:
@@ -172,11 +194,8 @@ def _local(database: str | Path, name: str) -> NDArray[np.float32]:
     return data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-6)
 
 
-def visual_words(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Cluster centres of descriptors, by Lloyd's algorithm with a fixed seed. [K, 128]"""
-    rng = np.random.default_rng(0)
-    if len(descriptors) > MAX_TRAINING:
-        descriptors = descriptors[rng.choice(len(descriptors), MAX_TRAINING, replace=False)]
+def visual_words(descriptors: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Cluster centres of descriptors, by Lloyd's algorithm. [K, D]"""
     count = min(WORDS, max(1, len(descriptors)))
     if not len(descriptors):
         return np.zeros((1, descriptors.shape[1]), np.float32)

@@ -59,6 +59,8 @@ class PeriodFigures:
     """Median reprojection error of its observations in the model, pixels."""
     observations: int
     gps: PeriodGpsFit | str
+    in_three: float | None = None
+    """Share of the points that its images see that three images or more see, of whatever date."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +210,14 @@ def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures
         error=float(np.median(error)) if len(error) else None,
         observations=len(rays),
         gps=gps,
+        in_three=_in_three(model, evidence.seen[:, period]),
     )
+
+
+def _in_three(model: Registered, seen: Mask) -> float | None:
+    """Share of some points that three images or more see."""
+    images = np.diff(model.track_start)[seen]
+    return float((images >= 3).mean()) if len(images) else None
 
 
 def _pair(

@@ -57,6 +57,9 @@ _LOOK = (
 )
 _WORST = "look at the worst pair on the page (--report); remove its photos if they do not fit"
 _PLACE = "check that the photos show this place; leave out those that do not"
+_REPEAT = (
+    "photograph again from where the photos of the other date were taken, in the same directions"
+)
 _CONTROL = "give ground control: --tie-points with world coordinates"
 
 THRESHOLDS: dict[str, Threshold] = {
@@ -64,8 +67,8 @@ THRESHOLDS: dict[str, Threshold] = {
         what="share of the photos of a period that are registered",
         doubtful=0.6, fail=0.1, larger_is_better=True,
         why="measurements say little about a period most of whose photos are missing",
-        todo="registration_log.json says why photos are missing; add photos with viewpoints "
-        "between those of the dates",
+        todo="registration_log.json says why photos are missing; add photos half a step apart "
+        "between them and their neighbours, and with viewpoints between those of the dates",
     ),
     "images": Threshold(
         what="registered images of a period",
@@ -129,7 +132,16 @@ THRESHOLDS: dict[str, Threshold] = {
         what="share of the images of a period that see tie points",
         doubtful=0.5, larger_is_better=True,
         why="images without any are held by their own period alone",
-        todo=_CLICK,
+        todo=_REPEAT,
+    ),
+    "in_three": Threshold(
+        what="share of the points of a period that three images or more see",
+        doubtful=0.5, larger_is_better=True,
+        why="photos that overlap with the next one alone let a row bend, and nothing shows it; "
+        "counts only beside other findings",
+        todo="photograph more, so that three photos show every spot: steps half as long, a second "
+        "pass along each row that looks to the side or back, and loops or crossings that connect "
+        "rows",
     ),
     "localised": Threshold(
         what="pose error of images localised from the other period, beyond its noise",
@@ -261,6 +273,8 @@ def judge(certificate: Certificate) -> Verdict:
         objections = [o for o in objections if o.level == "fail" or o.check not in LACKING]
     objections += _links(certificate, pairs, good)
     level = worst_level(f.level for f in objections)
+    if level != "pass":  # the cause of other findings, before them
+        objections = [f for p in certificate.periods for f in _thin(p)] + objections
     objections.sort(key=lambda f: -LEVELS.index(f.level))
     return Verdict(level, _words(certificate, level, objections), tuple(objections), pairs)
 
@@ -322,6 +336,12 @@ def _of_period(p: PeriodFigures) -> Iterator[Objection]:
             yield from _check("gps_scale", 100 * beyond, place)
         if gps.turn is not None and gps.turn_error is not None:
             yield from _check("gps_turn", abs(gps.turn) - 3 * gps.turn_error, place)
+
+
+def _thin(p: PeriodFigures) -> Iterator[Objection]:
+    """Objection to photos that overlap too little; no reason for doubt by itself."""
+    if p.in_three is not None:
+        yield from _check("in_three", p.in_three, f"period {p.label}")
 
 
 def _between_gps(certificate: Certificate) -> Iterator[Objection]:

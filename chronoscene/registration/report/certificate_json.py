@@ -65,6 +65,9 @@ def period_figures(period: PeriodFigures) -> Iterator[Figure]:
     else:
         over = f"{period.observations:,} observations"
         yield Figure("reprojection error, median", period.error, "px", over)
+    if period.in_three is not None:
+        share, over = 100 * period.in_three, "points that its images see"
+        yield Figure("points that three images or more see", share, "%", over)
     gps = period.gps
     if not isinstance(gps, PeriodGpsFit):
         yield Figure("GPS residual", None, "m", "", absent=gps)

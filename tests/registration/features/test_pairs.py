@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from chronoscene.registration.features import pairs as choice
 from chronoscene.registration.features.holdout import build_tracks, eligible_tracks, first_at_place
 from chronoscene.registration.features.pairs import (
     assign,
+    global_descriptors,
     sequential_pairs,
     similar_pairs,
     spatial_pairs,
@@ -62,13 +64,28 @@ def test_global_descriptors_tell_textures_apart() -> None:
         return np.asarray(chosen / np.linalg.norm(chosen, axis=1, keepdims=True), np.float32)
 
     local = [image(k) for k in (0, 0, 1, 1, 2, 3)]
-    words = visual_words(np.concatenate(local))
+    words = visual_words(np.concatenate(local), rng)
     vectors = np.stack([vlad(d, words) for d in local])
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=1e-5)
     similarity = vectors @ vectors.T
     assert min(similarity[0, 1], similarity[2, 3]) > similarity[0, 2:].max() + 0.2
     assert not vlad(np.zeros((0, 128), np.float32), words).any()
     assert assign(words, words).tolist() == list(range(len(words)))
+
+
+def test_words_are_learnt_from_a_sample_of_all_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where images have no features, or descriptors of another kind."""
+    rng = np.random.default_rng(2)
+    sizes = {"a": (60, 128), "none": (0, 128), "other": (7, 64), "b": (40, 128)}
+    local = {name: rng.normal(size=size).astype(np.float32) for name, size in sizes.items()}
+    monkeypatch.setattr(choice, "MAX_TRAINING", 80)
+    monkeypatch.setattr(choice, "_local", lambda database, name: local[name])
+    again = np.random.default_rng(0)
+    every = np.concatenate([local["a"], local["b"]])
+    words = visual_words(every[again.choice(100, 80, replace=False)], again)
+    nothing = local["none"]
+    expected = [vlad(d, words) for d in (local["a"], nothing, nothing, local["b"])]
+    np.testing.assert_array_equal(global_descriptors("", list(local)), np.stack(expected))
 
 
 KEYPOINTS = {

@@ -188,6 +188,23 @@ def test_missing_photos_are_counted_with_their_reasons(good: Registered) -> None
     assert verdict.objections[0].check == "registered"
 
 
+def test_points_that_three_images_see_are_counted(good: Registered) -> None:
+    """Images of any date count; points of two images are left where the rest of a track is cut."""
+    first, lengths = good.track_start[:-1], np.diff(good.track_start)
+    place = np.arange(len(good.track_image)) - np.repeat(first, lengths)
+    kept = place < np.where(np.arange(len(lengths)) % 4, 2, 3).repeat(lengths)
+    start = np.concatenate([[0], np.cumsum(np.add.reduceat(kept, first))])
+    cut = replace(
+        good, track_start=start, track_image=good.track_image[kept], track_xy=good.track_xy[kept]
+    )
+    three = np.diff(start) >= 3
+    for p, figures in enumerate(certify(cut).periods):
+        sees = np.logical_or.reduceat(good.periods[cut.track_image] == p, start[:-1])
+        assert figures.in_three == pytest.approx(three[sees].mean())
+        assert 0.1 < figures.in_three < 0.3
+    assert all(f.in_three is not None and f.in_three > 0.8 for f in certify(good).periods)
+
+
 def test_a_period_without_any_image(good: Registered) -> None:
     model = replace(good, num_periods=3, labels=("a", "b", "c"), dates=(None, None, None))
     certificate = certify(model)

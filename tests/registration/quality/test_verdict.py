@@ -563,6 +563,20 @@ def test_the_worst_comes_first_and_is_what_the_text_names() -> None:
     assert "do not prove it" in doubtful.text
 
 
+def test_a_row_that_is_not_proven_is_told_what_to_photograph() -> None:
+    assert judge(with_period(made(), in_three=0.4)).level == "pass"  # no doubt by itself
+    few = with_part(made(), "ties", tied_a=0.4)
+    assert found(judge(with_period(few, in_three=0.5))) == [("tied", "doubtful")]
+    verdict = judge(with_period(few, in_three=0.4))
+    assert found(verdict) == [("in_three", "doubtful"), ("tied", "doubtful")]
+    assert "Period May 2017: share of the points" in verdict.text
+    for words in ("steps half as long", "second pass", "to the side", "loops"):
+        assert words in verdict.todo[0]
+    assert "from where the photos of the other date were taken" in verdict.todo[1]
+    failed = judge(with_period(with_part(made(), "held_out", agreeing=0.1), in_three=0.4))
+    assert found(failed) == [("agreeing", "fail"), ("in_three", "doubtful")]
+
+
 def test_another_place_is_not_told_to_add_viewpoints_between() -> None:
     figures = {
         reason: PeriodFigures(1, "b", 0, 20, {reason: 20}, None, 0, "none")
