@@ -59,7 +59,7 @@ def few(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Few:
 
 
 def write_control(truth: Scene, chosen: list[int], path: Path) -> None:
-    """Points that all of these photos see, spread over the scene, with noise."""
+    """Points that three or all of these photos see, spread over the scene, with noise."""
     rng = np.random.default_rng(2)
     points = truth.points
     lines, taken = ["point,image,x,y,X,Y,Z,role,sX,sY,sZ\n"], list[np.ndarray]()
@@ -67,7 +67,7 @@ def write_control(truth: Scene, chosen: list[int], path: Path) -> None:
         rows = np.arange(points.track_start[i], points.track_start[i + 1])
         rows = rows[np.isin(points.track_frame[rows], chosen)]
         apart = [np.linalg.norm(points.xyz[i] - other) for other in taken]
-        if len(rows) < 4 or min(apart, default=99.0) < 3.0:
+        if len(rows) < 3 or min(apart, default=99.0) < 3.0:
             continue
         world = points.xyz[i] + rng.normal(0, SURVEY, 3)
         for row in rows:
