@@ -16,7 +16,7 @@ from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.photos.known_cameras import known_groups, read_cameras
 from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import Registered
-from chronoscene.scene import Scene
+from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 
 LABELS = ("2016", "2023")
@@ -59,28 +59,36 @@ def few(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Few:
 
 
 def write_control(truth: Scene, chosen: list[int], path: Path) -> None:
-    """Points that three or all of these photos see, spread over the scene, with noise."""
+    """Points inside all of these photos, seen or hidden, spread over the scene, with noise."""
     rng = np.random.default_rng(2)
     points = truth.points
     lines, taken = ["point,image,x,y,X,Y,Z,role,sX,sY,sZ\n"], list[np.ndarray]()
     for i in rng.permutation(len(points)):
-        rows = np.arange(points.track_start[i], points.track_start[i + 1])
-        rows = rows[np.isin(points.track_frame[rows], chosen)]
+        places = [projected(truth.frames[k], points.xyz[i]) for k in chosen]
         apart = [np.linalg.norm(points.xyz[i] - other) for other in taken]
-        if len(rows) < 3 or min(apart, default=99.0) < 3.0:
+        if any(place is None for place in places) or min(apart, default=99.0) < 3.0:
             continue
         world = points.xyz[i] + rng.normal(0, SURVEY, 3)
-        for row in rows:
-            frame = truth.frames[points.track_frame[row]]
-            x, y = points.track_xy[row] + rng.normal(0, CLICK_PIXELS, 2)
+        for k, place in zip(chosen, places, strict=True):
+            frame = truth.frames[k]
+            x, y = place + rng.normal(0, CLICK_PIXELS, 2)
             where = f"{LABELS[frame.period]}/{frame.name},{x:.3f},{y:.3f}"
-            place = ",".join(f"{v:.4f}" for v in world)
-            lines.append(f"g{len(taken)},{where},{place},control,{SURVEY},{SURVEY},{SURVEY}\n")
+            at = ",".join(f"{v:.4f}" for v in world)
+            lines.append(f"g{len(taken)},{where},{at},control,{SURVEY},{SURVEY},{SURVEY}\n")
         taken.append(points.xyz[i])
         if len(taken) == CONTROL:
             break
     assert len(taken) == CONTROL
     path.write_text("".join(lines))
+
+
+def projected(frame: Frame, point: np.ndarray) -> np.ndarray | None:
+    """Pixel of a world point, None outside of the photo."""
+    local = frame.cam_from_world[:3, :3] @ point + frame.cam_from_world[:3, 3]
+    place = (frame.camera.K @ local)[:2] / local[2]
+    inside = local[2] > 0 and (place > 0).all()
+    inside &= bool((place < [frame.camera.width, frame.camera.height]).all())
+    return place if inside else None
 
 
 def registered(few: Few, out: Path, points: Path) -> tuple[Registered, Inspection]:
