@@ -44,7 +44,7 @@ class PretendedGpu(TorchFunctionMode):
     def __init__(self) -> None:
         super().__init__()
         self.moves: list[str] = []
-        """What was copied between the devices, by the name of the function."""
+        """Copies between the devices, by the names of functions."""
         self._watches = True
 
     def __torch_function__(

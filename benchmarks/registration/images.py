@@ -47,7 +47,7 @@ class ImageCase:
     """JPEG."""
     gps: bool = True
     blocks: int = 2
-    """Of the city, along each axis."""
+    """Blocks of the city along each axis."""
     width: int = 800
     """Pixels."""
     height: int = 600

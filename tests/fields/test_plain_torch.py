@@ -35,9 +35,9 @@ WARM_UP = 8
 LOSS_TOLERANCE = 1e-6
 """Relative. Measured: 1.1e-7."""
 GRADIENT_TOLERANCE = 2e-5
-"""Of the largest of a tensor. Measured: 6.7e-6."""
+"""Relative to the largest of a tensor. Measured: 6.7e-6."""
 RENDER_TOLERANCE = 5e-6
-"""Of colours and opacities, and of depths relatively. Measured: 9e-7."""
+"""Tolerance of colours and opacities, and of depths relatively. Measured: 9e-7."""
 
 
 def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:

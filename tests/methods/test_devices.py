@@ -47,7 +47,7 @@ QUESTIONS = 3
 """To tensors in a step: what is in view, what of it is switched on; and how the step went. Of
 fields: how many samples there are, how many are seen; and how the step went."""
 MORE_QUESTIONS = {"ha-nerf": 1, "ha-nerf-t": 1}
-"""Which photos have been drawn, and have to be encoded."""
+"""The photos that have been drawn have to be encoded."""
 SMALL_FIELD = {"levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
 """Fields in plain torch are slow on a CPU."""
 

@@ -32,9 +32,9 @@ from chronoscene.kernels.vectors import (
     trailing_zeros,
 )
 from chronoscene.synth.render.mesh import MISS
-from chronoscene.synth.render.noise import dot
+from chronoscene.synth.render.noise import dot, plus, scaled
 
-WIDTH = 8  # Boxes of a node
+_WIDTH = 8  # Boxes of a node
 _LEAF = 2  # Triangles of a box that is not divided
 _BINS = 16
 _STACK = 512  # Open nodes: seven of each level, and no tree has more than 70 levels
@@ -43,8 +43,8 @@ _MARGIN = np.float32(2e-6)  # Relative error of distances to boxes in single pre
 _ON_BOX = 1e-7  # The same in double precision, less than _MARGIN
 _FAR = np.float32(1e30)
 
-_load = make_load(WIDTH)
-_ones, _zeros = make_constant([1] * WIDTH), make_constant([0] * WIDTH)
+_load = make_load(_WIDTH)
+_ones = make_constant([1] * _WIDTH)
 
 
 class Hits(NamedTuple):
@@ -60,11 +60,11 @@ class Hits(NamedTuple):
 
 class _Tree(NamedTuple):
     boxes: NDArray[np.float32]
-    """Lowest x, y, z of the boxes of each node, then the highest. [nodes * 6 * WIDTH]"""
+    """Lowest x, y, z of the boxes of each node, then the highest. [nodes * 6 * _WIDTH]"""
     first: NDArray[np.int32]
-    """Node in a box, or the first of its triangles. [nodes * WIDTH]"""
+    """Node in a box, or the first of its triangles. [nodes * _WIDTH]"""
     triangles: NDArray[np.int32]
-    """Number of triangles in a box; 0 if it has a node. [nodes * WIDTH]"""
+    """Number of triangles in a box; 0 if it has a node. [nodes * _WIDTH]"""
     corners: NDArray[np.float32]
     """Triangles in the order of the boxes. [T, 3, 3]"""
     number: NDArray[np.uint32]
@@ -189,9 +189,13 @@ def _build(low, high):
     bins = np.empty(len(low), np.int8)
     bin_boxes, bin_counts, right = np.empty((_BINS, 6)), np.empty(_BINS, np.int64), np.empty(_BINS)
     room = max(1, len(low) // 8)
-    boxes = np.empty((room, 6, WIDTH), np.float32)
-    first, count = np.zeros((room, WIDTH), np.int32), np.zeros((room, WIDTH), np.int32)
-    starts, ends, parts = np.empty(WIDTH, np.int64), np.empty(WIDTH, np.int64), np.empty((WIDTH, 6))
+    boxes = np.empty((room, 6, _WIDTH), np.float32)
+    first, count = np.zeros((room, _WIDTH), np.int32), np.zeros((room, _WIDTH), np.int32)
+    starts, ends, parts = (
+        np.empty(_WIDTH, np.int64),
+        np.empty(_WIDTH, np.int64),
+        np.empty((_WIDTH, 6)),
+    )
     ranges = [(0, len(low))]  # Triangles of each node
     node = 0
     while node < len(ranges):
@@ -202,7 +206,7 @@ def _build(low, high):
         starts[0], ends[0] = ranges[node]
         _bounds(low, high, order, starts[0], ends[0], parts[0])
         used = 1
-        while used < WIDTH:
+        while used < _WIDTH:
             widest, area = -1, -1.0
             for k in range(used):
                 if ends[k] - starts[k] > _LEAF and _half_area(parts[k]) > area:
@@ -247,46 +251,46 @@ def _inverse(d):
 @inlined
 def _hit_boxes(boxes, node, origin, inverse, near_planes, limit, distances):
     """Mark the boxes that a ray enters before a limit, a byte for each; write where it enters."""
-    at, far_planes = node * (6 * WIDTH), 3 * WIDTH
+    at, far_planes = node * (6 * _WIDTH), 3 * _WIDTH
     near = maximum(
         maximum(
             (_load(boxes, at + near_planes[0]) - origin[0]) * inverse[0],
-            (_load(boxes, at + WIDTH + near_planes[1]) - origin[1]) * inverse[1],
+            (_load(boxes, at + _WIDTH + near_planes[1]) - origin[1]) * inverse[1],
         ),
         maximum(
-            (_load(boxes, at + 2 * WIDTH + near_planes[2]) - origin[2]) * inverse[2], np.float32(0)
+            (_load(boxes, at + 2 * _WIDTH + near_planes[2]) - origin[2]) * inverse[2], np.float32(0)
         ),
     )
     far = minimum(
         minimum(
             (_load(boxes, at + far_planes - near_planes[0]) - origin[0]) * inverse[0],
-            (_load(boxes, at + WIDTH + far_planes - near_planes[1]) - origin[1]) * inverse[1],
+            (_load(boxes, at + _WIDTH + far_planes - near_planes[1]) - origin[1]) * inverse[1],
         ),
         minimum(
-            (_load(boxes, at + 2 * WIDTH + far_planes - near_planes[2]) - origin[2]) * inverse[2],
+            (_load(boxes, at + 2 * _WIDTH + far_planes - near_planes[2]) - origin[2]) * inverse[2],
             limit,
         ),
     )
     store(distances, 0, near)
     mask = near * (np.float32(1) - _MARGIN) <= far * (np.float32(1) + _MARGIN)
-    return pack_bytes(select(mask, _ones(), _zeros()))
+    return pack_bytes(select(mask, _ones(), 0))
 
 
 @inlined
 def _near_boxes(boxes, node, point, limit, distances):
     """Mark the boxes nearer to a point than a limit, a byte for each; write squared distances."""
-    at = node * (6 * WIDTH)
+    at = node * (6 * _WIDTH)
     square = _squared_gap(boxes, at, point[0])
-    square = square + _squared_gap(boxes, at + WIDTH, point[1])
-    square = square + _squared_gap(boxes, at + 2 * WIDTH, point[2])
+    square = square + _squared_gap(boxes, at + _WIDTH, point[1])
+    square = square + _squared_gap(boxes, at + 2 * _WIDTH, point[2])
     store(distances, 0, square)
     mask = square * (np.float32(1) - _MARGIN) <= limit
-    return pack_bytes(select(mask, _ones(), _zeros()))
+    return pack_bytes(select(mask, _ones(), 0))
 
 
 @inlined
 def _squared_gap(boxes, at, x):
-    low, high = _load(boxes, at) - x, x - _load(boxes, at + 3 * WIDTH)
+    low, high = _load(boxes, at) - x, x - _load(boxes, at + 3 * _WIDTH)
     gap = maximum(maximum(low, high), np.float32(0))
     return gap * gap
 
@@ -298,7 +302,7 @@ def _push(marked, node, distances, stack, open_at, top):
     while marked != 0:
         k = trailing_zeros(marked) >> 3
         marked &= marked - np.uint64(1)
-        box, distance = node * WIDTH + k, distances[k]
+        box, distance = node * _WIDTH + k, distances[k]
         place = top
         while place > base and open_at[place - 1] < distance:
             stack[place], open_at[place] = stack[place - 1], open_at[place - 1]
@@ -365,6 +369,12 @@ def _between(a, b, c, x):
 
 
 @inner
+def _room():
+    """Memory of a search: boxes to look into and distances to them; distances within a node."""
+    return np.empty(_STACK, np.int64), np.empty(_STACK, np.float32), np.empty(_WIDTH, np.float32)
+
+
+@inner
 def _first_hit(tree, rays, i, guess, stack, open_at, distances, anything):
     """First hit of a ray, or ``anything`` that it hits: t, place in the tree or -1, u, v.
 
@@ -374,7 +384,7 @@ def _first_hit(tree, rays, i, guess, stack, open_at, distances, anything):
     origin = (np.float64(start[0]), np.float64(start[1]), np.float64(start[2]))
     d = (np.float64(rays[i, 3]), np.float64(rays[i, 4]), np.float64(rays[i, 5]))
     inverse = (_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
-    side = 3 * WIDTH
+    side = 3 * _WIDTH
     near_planes = (
         side if inverse[0] < 0 else 0,
         side if inverse[1] < 0 else 0,
@@ -416,8 +426,7 @@ def _cast(tree, rays):
     t, number = np.empty(n, np.float32), np.empty(n, np.uint32)
     uv = np.empty((n, 2), np.float32)
     for task in prange((n + _AT_A_TIME - 1) // _AT_A_TIME):
-        stack, open_at = np.empty(_STACK, np.int64), np.empty(_STACK, np.float32)
-        distances = np.empty(WIDTH, np.float32)
+        stack, open_at, distances = _room()
         place = -1
         for i in range(task * _AT_A_TIME, min(n, (task + 1) * _AT_A_TIME)):
             t[i], place, uv[i, 0], uv[i, 1] = _first_hit(
@@ -432,19 +441,13 @@ def _occluded(tree, rays):
     n = len(rays)
     out = np.empty(n, np.bool_)
     for task in prange((n + _AT_A_TIME - 1) // _AT_A_TIME):
-        stack, open_at = np.empty(_STACK, np.int64), np.empty(_STACK, np.float32)
-        distances = np.empty(WIDTH, np.float32)
+        stack, open_at, distances = _room()
         guess = -1
         for i in range(task * _AT_A_TIME, min(n, (task + 1) * _AT_A_TIME)):
             place = _first_hit(tree, rays, i, guess, stack, open_at, distances, True)[1]
             out[i] = place >= 0
             guess = place if place >= 0 else guess
     return out
-
-
-@inner
-def _along(a, b, s):
-    return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
 
 
 @inner
@@ -466,16 +469,43 @@ def _squared_distance(corners, tri, p):
     elif d6 >= 0.0 and d5 <= d6:
         nearest = c
     elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        nearest = _along(a, ab, d1 / (d1 - d3))
+        nearest = plus(a, scaled(ab, d1 / (d1 - d3)))
     elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        nearest = _along(a, ac, d2 / (d2 - d6))
+        nearest = plus(a, scaled(ac, d2 / (d2 - d6)))
     elif va <= 0.0 and d4 >= d3 and d5 >= d6:
-        nearest = _along(b, bc, (d4 - d3) / ((d4 - d3) + (d5 - d6)))
+        nearest = plus(b, scaled(bc, (d4 - d3) / ((d4 - d3) + (d5 - d6))))
     else:
         total = va + vb + vc
-        nearest = _along(_along(a, ab, vb / total), ac, vc / total)
+        nearest = plus(plus(a, scaled(ab, vb / total)), scaled(ac, vc / total))
     gap = _minus(p, nearest)
     return dot(gap, gap)
+
+
+@inner
+def _nearest_triangle(tree, p, stack, open_at, distances):
+    """Squared distance from a point to the nearest triangle, and its number."""
+    rounded = (np.float32(p[0]), np.float32(p[1]), np.float32(p[2]))
+    # What rounding the point may add to a distance.
+    slack = 1e-6 * (abs(p[0]) + abs(p[1]) + abs(p[2]))
+    best, number, limit = np.inf, np.uint32(MISS), np.float32(np.inf)
+    marked = _near_boxes(tree.boxes, 0, rounded, limit, distances)
+    top = _push(marked, 0, distances, stack, open_at, 0)
+    while top > 0:
+        top -= 1
+        box = stack[top]
+        if open_at[top] * (np.float32(1) - _MARGIN) > limit:
+            continue
+        inside = tree.first[box]
+        if tree.triangles[box] == 0:
+            marked = _near_boxes(tree.boxes, inside, rounded, limit, distances)
+            top = _push(marked, inside, distances, stack, open_at, top)
+            continue
+        for k in range(inside, inside + tree.triangles[box]):
+            square = _squared_distance(tree.corners, k, p)
+            if square < best or (square == best and tree.number[k] < number):
+                best, number = square, tree.number[k]
+                limit = np.float32((math.sqrt(square) + slack) ** 2) * (np.float32(1) + _MARGIN)
+    return best, number
 
 
 @kernel(parallel=True)
@@ -483,33 +513,9 @@ def _nearest(tree, points):
     n = len(points)
     out, numbers = np.empty(n), np.empty(n, np.uint32)
     for task in prange((n + _AT_A_TIME - 1) // _AT_A_TIME):
-        stack, open_at = np.empty(_STACK, np.int64), np.empty(_STACK, np.float32)
-        distances = np.empty(WIDTH, np.float32)
+        stack, open_at, distances = _room()
         for i in range(task * _AT_A_TIME, min(n, (task + 1) * _AT_A_TIME)):
             p = (points[i, 0], points[i, 1], points[i, 2])
-            rounded = (np.float32(p[0]), np.float32(p[1]), np.float32(p[2]))
-            # What rounding the point may add to a distance.
-            slack = 1e-6 * (abs(p[0]) + abs(p[1]) + abs(p[2]))
-            best, number = np.inf, np.uint32(MISS)
-            limit = np.float32(np.inf)
-            marked = _near_boxes(tree.boxes, 0, rounded, limit, distances)
-            top = _push(marked, 0, distances, stack, open_at, 0)
-            while top > 0:
-                top -= 1
-                box = stack[top]
-                if open_at[top] * (np.float32(1) - _MARGIN) > limit:
-                    continue
-                inside = tree.first[box]
-                if tree.triangles[box] == 0:
-                    marked = _near_boxes(tree.boxes, inside, rounded, limit, distances)
-                    top = _push(marked, inside, distances, stack, open_at, top)
-                    continue
-                for k in range(inside, inside + tree.triangles[box]):
-                    square = _squared_distance(tree.corners, k, p)
-                    if square < best or (square == best and tree.number[k] < number):
-                        best, number = square, tree.number[k]
-                        limit = np.float32((math.sqrt(square) + slack) ** 2) * (
-                            np.float32(1) + _MARGIN
-                        )
-            out[i], numbers[i] = math.sqrt(best), number
+            square, numbers[i] = _nearest_triangle(tree, p, stack, open_at, distances)
+            out[i] = math.sqrt(square)
     return out, numbers
