@@ -204,7 +204,7 @@ def bench(
     iterations: int | None = None,
     budget: str | float | None = None,
     seeds: Sequence[int] = (0,),
-    strategies: str | Sequence[str] = "joint",
+    strategies: str | Sequence[str] = (),
     overrides: Mapping[str, object] | None = None,
     max_width: int = MAX_WIDTH,
     validation: bool = False,
@@ -230,7 +230,8 @@ def bench(
         budget: End of the training by the clock: seconds, or a text such as ``5m``. Schedules
             follow the clock then, and equal seeds do not give equal models.
         seeds: Each method is trained once per seed.
-        strategies: One or several of ``joint``, ``pooled``, ``separate`` and ``sequential``.
+        strategies: One or several of ``joint``, ``pooled``, ``separate`` and ``sequential``; none
+            for that of each method.
         overrides: Options of the methods: ``key`` for all methods, ``method.key`` for one.
         max_width: Wider images are scaled down to this width in pixels.
         validation: Hold blocks of the training views back and score these; test views are not read.

@@ -47,6 +47,7 @@ SPEC = MethodSpec(
         "balanced": _SHORT | {"iterations": 3_000, "reset_interval": 8_000},
         "fast": _SHORT | _TUNED | {"iterations": 1_000, "reset_interval": 30_000},
     },
+    strategy="sequential",
     per_period=("paper", "paper-released"),
     resumable=True,
     main_options=(*MAIN_OPTIONS, "change_threshold", "dilation", "vote_share", "samples"),

@@ -22,6 +22,7 @@ _COMMON: dict[str, Any] = {
     "period_input": "continuous",
     "outputs": ("rgb", "alpha", "depth"),
     "devices": ("cpu", "cuda"),
+    "strategy": "sequential",
     "per_period": ("paper",),
     "mixes_views": True,
     "learns_background": True,

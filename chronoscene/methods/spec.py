@@ -105,6 +105,9 @@ class MethodSpec:
     """Preset name to the values that differ from the defaults of the config class."""
     titles: Mapping[str, str] = field(default_factory=dict)
     """Names in tables of presets of which `title` would say too much or too little."""
+    strategy: str = "joint"
+    """Strategy of runs for which none is asked: ``sequential`` if the method is made for periods
+    that come one by one."""
     mixes_views: bool = False
     """True if a step learns from pixels of all views at once: no single one makes it empty."""
     learns_background: bool = False

@@ -80,7 +80,7 @@ def describe(spec: MethodSpec, runs: Path, *, everything: bool = True) -> Iterat
     yield f"period input: {spec.period_input}; outputs: {', '.join(spec.outputs)}; " + (
         f"devices: {', '.join(spec.devices)}; can be resumed: {'yes' if spec.resumable else 'no'}"
     )
-    yield f"presets: {', '.join(spec.presets)}"
+    yield f"strategy: {spec.strategy}; presets: {', '.join(spec.presets)}"
     if spec.runner is not None:
         yield f"external program, installed apart from ChronoScene; {spec.runner.tested}; commands:"
         for words in (spec.runner.train, *spec.runner.render):

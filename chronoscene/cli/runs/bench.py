@@ -58,8 +58,8 @@ WIDTH = click.option(
 @click.option(
     "--strategy",
     "strategies",
-    default="joint",
-    help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.",
+    help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.  [default: that of the "
+    "method: sequential for continual learning, else joint]",
 )
 @click.option(
     "--protocol",
@@ -146,7 +146,8 @@ def command(
         fixed = PROTOCOLS[protocol].options().items()
         source = context.get_parameter_source
         options |= {k: v for k, v in fixed if source(k) is ParameterSource.DEFAULT}
-    options["strategies"] = split_list("--strategy", options["strategies"])
+    asked = options["strategies"]
+    options["strategies"] = () if asked is None else split_list("--strategy", asked)
     settings = settings_from(
         methods=names,
         seeds=tuple(range(seed, seed + seeds)),

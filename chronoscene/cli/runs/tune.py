@@ -27,12 +27,14 @@ from chronoscene.io.tables import boxed_text
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of search and trainings.")
 @click.option(
-    "--strategy", default="joint", type=click.Choice([*STRATEGIES]), help="Strategy of the trials."
+    "--strategy",
+    type=click.Choice([*STRATEGIES]),
+    help="Strategy of the trials.  [default: that of the method]",
 )
 @reading_options("the scenes")
 @add_options("preset", "iterations", "jobs", "job_memory", "ray", "threads", "device")
 @click.option("--out", type=FOLDER, required=True, help="Folder for the search.")
-def command(method: str, trials: int, seed: int, strategy: str, out: Path, **options: Any) -> None:
+def command(method: str, trials: int, seed: int, strategy: str | None, out: Path, **options: Any) -> None:
     """Search for options by scores on validation views.
 
     Each trial trains METHOD on each scene with other options, as bench --validation does it; the
@@ -42,7 +44,12 @@ def command(method: str, trials: int, seed: int, strategy: str, out: Path, **opt
     """
     look_here_for([method])
     settings = settings_from(
-        methods=(method,), strategies=(strategy,), seeds=(seed,), out=out, assignments=(), **options
+        methods=(method,),
+        strategies=(strategy,) if strategy else (),
+        seeds=(seed,),
+        out=out,
+        assignments=(),
+        **options,
     )
     results = tune(settings, trials, say)
     emit(boxed_text(trials_table(results), width=terminal_width(None)), None)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 
 from chronoscene.harness.contract.subject import NotApplicableError, Subject, demand, python
+from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.train.checks import refuse
 from chronoscene.methods import build_config
 from chronoscene.methods.search_space import ends, starting_point
@@ -27,6 +28,9 @@ def spec_is_plain_data(subject: Subject) -> None:
         spec.period_input in inputs, "MethodSpec.period_input", " or ".join(inputs),
         spec.period_input,
     )  # fmt: skip
+    demand(
+        spec.strategy in STRATEGIES, "MethodSpec.strategy", " or ".join(STRATEGIES), spec.strategy
+    )
     outputs = {"rgb", "alpha", "depth"}
     demand(
         {"rgb"} <= set(spec.outputs) <= outputs, "MethodSpec.outputs",

@@ -63,7 +63,12 @@ def _runs_of_scene(
     settings: BenchSettings, scene: BenchScene, methods: list[ResolvedMethod]
 ) -> Iterator[ResolvedRun]:
     """Yield every method, strategy and seed on one scene, checked."""
-    for method, wanted, seed in product(methods, settings.strategies, settings.seeds):
+    asked = [
+        (method, strategy)
+        for method in methods
+        for strategy in settings.strategies or (method.spec.strategy,)
+    ]
+    for (method, wanted), seed in product(asked, settings.seeds):
         strategy, notices = _strategy(method, wanted)
         own = method.settings
         if own.budget_seconds is not None:

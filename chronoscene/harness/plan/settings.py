@@ -80,7 +80,8 @@ class BenchSettings:
     methods: tuple[str, ...]
     """Names, or ``module:SPEC``."""
     run: RunSettings
-    strategies: tuple[str, ...] = ("joint",)
+    strategies: tuple[str, ...] = ()
+    """None: `MethodSpec.strategy` of each method."""
     seeds: tuple[int, ...] = (0,)
     continue_to: int | None = None
     """Train finished runs further, up to this many iterations."""

@@ -137,6 +137,8 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
     settings = replace(settings, run=replace(settings.run, validation=True))
     (reference,), (seed,), run = settings.methods, settings.seeds, settings.run
     method = resolve_method(reference, load_spec(reference), run)
+    strategies = settings.strategies or (method.spec.strategy,)
+    settings = replace(settings, strategies=strategies)
     start = starting_point(method.spec, method.config)
     scenes = []
     for found in settings.scenes:
@@ -153,7 +155,7 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
             for name, space in method.spec.search.items()
         },
         "scenes": scenes,
-        "strategy": settings.strategies[0],
+        "strategy": strategies[0],
         "max_width": run.max_width,
         "seed": seed,
     }

@@ -189,6 +189,7 @@ TUNED = replace(
 FIXED = spec("fixed", FixedPeriods)
 DRAWING = spec("drawing", Drawing)
 DATED = replace(spec("dated", MeanColour), per_period=("balanced",))
+CONTINUAL = replace(spec("continual", MeanColour), strategy="sequential")
 BLIND = spec("blind", MeanColour, period_input="none")
 RAISES = spec("raises", Raises)
 NOT_FINITE = replace(

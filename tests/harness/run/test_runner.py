@@ -96,6 +96,13 @@ def test_strategies_show_in_the_numbers(finished_bench):
     assert blind.notices == ["blind takes no period: joint is run and recorded as pooled"]
 
 
+def test_a_method_has_its_own_strategy_unless_another_is_asked_for(bench_here):
+    own, _ = bench_here("MEAN", "CONTINUAL", iterations=4)
+    asked, _ = bench_here("MEAN", "CONTINUAL", iterations=4, strategies=("pooled", "joint"))
+    strategies = [[read_run(folder).strategy for folder in made.finished] for made in (own, asked)]
+    assert strategies == [["joint", "sequential"], ["pooled", "joint", "pooled", "joint"]]
+
+
 def test_failures_stop_nobody_else(finished_bench):
     runs, outcome, said = finished_bench
     assert len(outcome.finished) == 2
