@@ -34,7 +34,9 @@ from chronoscene.io.tables import boxed_text
 @reading_options("the scenes")
 @add_options("preset", "iterations", "jobs", "job_memory", "ray", "threads", "device")
 @click.option("--out", type=FOLDER, required=True, help="Folder for the search.")
-def command(method: str, trials: int, seed: int, strategy: str | None, out: Path, **options: Any) -> None:
+def command(
+    method: str, trials: int, seed: int, strategy: str | None, out: Path, **options: Any
+) -> None:
     """Search for options by scores on validation views.
 
     Each trial trains METHOD on each scene with other options, as bench --validation does it; the
