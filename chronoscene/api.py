@@ -208,6 +208,7 @@ def bench(
     overrides: Mapping[str, object] | None = None,
     max_width: int = MAX_WIDTH,
     validation: bool = False,
+    fit_half: bool = False,
     device: str = "auto",
     threads: int | None = None,
     jobs: int | None = None,
@@ -235,6 +236,8 @@ def bench(
         overrides: Options of the methods: ``key`` for all methods, ``method.key`` for one.
         max_width: Wider images are scaled down to this width in pixels.
         validation: Hold blocks of the training views back and score these; test views are not read.
+        fit_half: Fit the appearance of each test view to the left half of its photo, and score the
+            right half.
         device: ``auto``, ``cpu`` or ``cuda``.
         threads: Threads per run; None for all cores.
         jobs: Number of runs at a time; None for one.
@@ -261,6 +264,7 @@ def bench(
         budget_seconds=parse_duration(budget, "budget") if isinstance(budget, str) else budget,
         max_width=max_width,
         validation=validation,
+        fit_half=fit_half,
         threads=threads,
         device=device,
         strategies=_several(strategies),

@@ -193,6 +193,8 @@ def _check_texts(record: RunRecord) -> None:
         raise ValueError(f"variant is no list of options: {record.variant[:60]!r}")
     if "validation=true" in record.variant.split(","):
         raise ValueError("scores of validation views: run bench without --validation")
+    if record.fitted:
+        raise ValueError("scores of halves of photos: run bench without --fit-half")
     for name in ("scene_hash", "split_hash", "config_hash"):
         if not _HASH.fullmatch(getattr(record, name)):
             raise ValueError(f"{name} is no SHA-256")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,17 @@ from torch import Tensor
 
 from baselines.nerf.config import HaNerfConfig
 from baselines.nerf.encoder import encode_photos, initial_encoder, small_photo
-from baselines.nerf.method import Nerf
+from baselines.nerf.method import LitNerf
 from chronoscene.fields.method import Drawn
 from chronoscene.fields.network import named
 from chronoscene.fields.rays import PixelPool, Rays
-from chronoscene.methods import StepReport, TrainingSet
+from chronoscene.methods import StepReport, TrainingSet, View
 
 _BATCH = 64  # Photos that are encoded at a time
 _LEAST_MASK_WEIGHT, _MASK_DECAY = 0.006, 1e-3  # As in the official command lines; per step
 
 
-class HaNerf(Nerf):
+class HaNerf(LitNerf):
     """NeRF with the light of each photo from an encoder, and masks of transient things.
 
     A rendered view has the mean code of the training photos of its period; the model stores these
@@ -38,13 +39,18 @@ class HaNerf(Nerf):
 
     def make_pool(self, train: TrainingSet) -> PixelPool:
         pool = super().make_pool(train)
-        size = self.config.photo_size
         indices = range(len(train.views))
-        small = [small_photo(train.load_image(i), train.load_mask(i), size) for i in indices]
-        values = np.stack(small).astype(np.float32).transpose(0, 3, 1, 2) / np.float32(127.5) - 1
-        self.photos = self.tensor(values)
+        self.photos = self._small((train.load_image(i), train.load_mask(i)) for i in indices)
         self._means: Tensor | None = None
         return pool
+
+    def _small(
+        self, photos: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]
+    ) -> Tensor:
+        """Return what the encoder is given of photos and their masks. [V, 3, S, S]"""
+        small = np.stack([small_photo(*photo, self.config.photo_size) for photo in photos])
+        values = small.astype(np.float32).transpose(0, 3, 1, 2) / np.float32(127.5) - 1
+        return self.tensor(values)
 
     def initial(self, train: TrainingSet, generator: torch.Generator) -> dict[str, Tensor]:
         params = super().initial(train, generator)
@@ -74,6 +80,14 @@ class HaNerf(Nerf):
         photos = self.photos.index_select(0, found)
         self._codes = encode_photos(photos, self.network.layers("encoder"))
         return self._codes.index_select(0, places)
+
+    @torch.no_grad()
+    def light_of(
+        self, view: View, period: float, photo: NDArray[np.uint8], known: NDArray[np.bool_]
+    ) -> Tensor:
+        """Encode the known pixels of a photo; nothing is fitted."""
+        del view, period
+        return encode_photos(self._small([(photo, known)]), self.network.layers("encoder"))
 
     def mean_light(self, weights: NDArray[np.float32]) -> Tensor:
         return (self.tensor(weights)[:, None] * self.period_lights()).sum(0, keepdim=True)

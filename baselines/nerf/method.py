@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import ClassVar
 
 import numpy as np
@@ -15,13 +16,16 @@ from baselines.nerf.time import FIRST_WIDTH, step_code, wave_code
 from chronoscene.fields.method import Drawn, FieldMethod
 from chronoscene.fields.mlp import equal_groups, initial_layers, mlp
 from chronoscene.fields.network import Codes, FieldNetwork, frequency_code, named
-from chronoscene.fields.rays import Rays
-from chronoscene.methods import TrainingSet
+from chronoscene.fields.rays import PixelPool, Rays
+from chronoscene.methods import TrainingSet, TrainingView, View
+from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.periods import period_weights
 
 _PIXEL_FREQUENCIES = 10
 _MASK_CODE = 128
 _MASK_HIDDEN = 64
+_FIT_STEPS, _FIT_RAYS, _FIT_RATE = 60, 256, 0.02
+"""Of the light of a test photo; README.md has what longer fits gain."""
 
 
 class Nerf(FieldMethod):
@@ -36,6 +40,8 @@ class Nerf(FieldMethod):
     geometry_varies = False
     config: NerfConfig
     network: NerfNetwork
+    light: Tensor | None = None
+    """Code of the light of rendered views; None for the mean of their period. [1, A]"""
 
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
         super().setup(train, seed=seed, device=device)
@@ -95,7 +101,8 @@ class Nerf(FieldMethod):
         period = torch.full((1,), appearance_period, dtype=torch.float64, device=self.device)
         color = self.time_code(self.times(period))
         if self.config.appearance != "none":
-            color = torch.cat((color, self.mean_light(weights)), dim=1)
+            light = self.mean_light(weights) if self.light is None else self.light
+            color = torch.cat((color, light), dim=1)
         return Codes(color[:, :0], color)
 
     def geometry_code(self, period: int) -> Tensor:
@@ -160,7 +167,42 @@ class NerfT(Nerf):
     name = "nerf-t"
 
 
-class NerfW(Nerf):
+class LitNerf(Nerf):
+    """Base class where each photo has a light of its own."""
+
+    def fitted_to(
+        self, view: View, period: float, photo: NDArray[np.uint8], known: NDArray[np.bool_]
+    ) -> LitNerf:
+        """Return the model with the light that renders the known pixels of a photo best."""
+        fitted = copy(self)
+        if self.config.appearance != "none" and known.any():
+            fitted.light = self.light_of(view, period, photo, known)
+        return fitted
+
+    def light_of(
+        self, view: View, period: float, photo: NDArray[np.uint8], known: NDArray[np.bool_]
+    ) -> Tensor:
+        """Fit the code of a photo's light to its known pixels, from the mean of its period."""
+        taken = TrainingView(view.K, view.width, view.height, view.cam_from_world, "", 0)
+        pool = PixelPool([taken], lambda _: photo, lambda _: known, device=self.device)
+        model, generator = copy(self), np.random.default_rng(self.seed)
+        weights = period_weights(period, int(self.meta["num_periods"]))
+        model.light = self.mean_light(weights).detach().clone().requires_grad_()
+        optimizer = Adam({"light": model.light})
+        for _ in range(_FIT_STEPS):
+            rays = pool.draw(generator, _FIT_RAYS)
+            middle = torch.full_like(rays.depths, 0.5)
+            samples = self.march(rays, rays.views + self.nearest_period(period), middle)
+            codes = model.view_codes(period, period)
+            wide = Codes(*(code.expand(len(middle), -1) for code in codes))
+            drawn, _ = self.draw(rays, samples, wide)
+            error = (drawn.rgb - rays.colors).square().mean()
+            (model.light.grad,) = torch.autograd.grad(error, model.light)
+            optimizer.step({"light": _FIT_RATE})
+        return model.light.detach()
+
+
+class NerfW(LitNerf):
     """NeRF-W: light of each photo, transient things with uncertainty.
 
     Source: Martin-Brualla et al. 2021, "NeRF in the Wild".
@@ -175,7 +217,7 @@ class NerfWT(NerfW):
     name = "nerf-w-t"
 
 
-class NeuSC(Nerf):
+class NeuSC(LitNerf):
     """NeuSC: content in steps of the time, light of each photo, masks of transient things.
 
     Source: Lin et al. 2023, "Neural Scene Chronology".

@@ -69,6 +69,7 @@ CASES = (
     ImageCase("four periods, all rebuilt", 40, periods=4, rebuilt=1.0),
     ImageCase("street, two periods", 41, kind="street"),
     ImageCase("street, two periods, 40 photos a date", 45, kind="street", views=40),
+    ImageCase("street, two periods, 80 photos a date", 45, kind="street", views=80),
     ImageCase("street, half rebuilt, dark", 42, kind="street", rebuilt=0.5, gamma=1.6),
     ImageCase("other place", 43, other_place=True),
     ImageCase("other place, no GPS", 44, other_place=True, gps=False),

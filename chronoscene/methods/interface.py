@@ -203,6 +203,21 @@ class Method(Protocol):
         Only where a method keeps them apart; one that does not has no such function.
         """
 
+    def fitted_to(
+        self, view: View, period: float, photo: NDArray[np.uint8], known: NDArray[np.bool_]
+    ) -> Method:
+        """Return the model with its appearance fitted to some pixels of the photo of a view.
+
+        For ``bench --fit-half``; only where appearance belongs to single photos, else there is no
+        such function. The model itself does not change, and pixels that are not known are not read.
+
+        Args:
+            view: The camera of the photo.
+            period: As for `render`.
+            photo: [H, W, 3]
+            known: Pixels that may be used. [H, W]
+        """
+
     def to_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
         """Return the model as of a period as Gaussians with spherical harmonics.
 

@@ -17,6 +17,7 @@ from chronoscene.fields.method import Drawn, FieldMethod
 from chronoscene.fields.occupancy import start_occupancy
 from chronoscene.fields.rays import PixelPool, view_rays
 from chronoscene.harness.contract.tiny_training import make_stage
+from chronoscene.harness.score.regions import left_half
 from chronoscene.harness.train.painted_balls import make_training_set
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, build_config, import_object, load_spec
@@ -270,3 +271,19 @@ def test_uncertainty_of_one_leaves_the_squared_error() -> None:
     rays = method.pool.draw(np.random.default_rng(0), 5)
     error = (drawn.rgb - rays.colors).square().mean()
     assert float(method.loss(drawn, rays, 0.0)) == pytest.approx(float(error / 2 + 3), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["nerf-w-t", "neusc"])
+def test_light_is_fitted_to_known_pixels(name: str) -> None:
+    """They get the light of their photo, whatever that of its period is."""
+    data = make_training_set(3)
+    method = begun(name, data)
+    go_on(method, 0, STEPS)
+    view, known = data.views[0], left_half(data.views[0].height, data.views[0].width)
+    dark = (0.3 * data.load_image(0)).astype(np.uint8)
+    errors = [
+        np.square(model.render(view, 0.0).rgb - dark / 255.0)[known].mean()
+        for model in (method, method.fitted_to(view, 0.0, dark, known))  # type: ignore[attr-defined]
+    ]
+    assert errors[1] < 0.7 * errors[0]
+    assert method.light is None  # type: ignore[attr-defined]

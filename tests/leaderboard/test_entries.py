@@ -91,6 +91,10 @@ HOSTILE = {
         lambda d: first(d).update(variant="sh_degree=2,validation=true"),
         "validation views: run bench without --validation",
     ),
+    "half of the photos": (
+        lambda d: first(d).update(fitted="left half"),
+        "halves of photos: run bench without --fit-half",
+    ),
     "seed twice": (lambda d: d["runs"].append(d["runs"][0]), "a seed twice"),
     "two methods": (lambda d: first(d).update(method="other"), "runs that differ in method"),
     "no runs": (lambda d: d.update(runs=[]), "at least 1 item"),

@@ -117,6 +117,12 @@ WIDTH = click.option(
     help="Hold blocks of the training views back and score these; test views are not read. "
     "For choosing options.",
 )
+@click.option(
+    "--fit-half",
+    is_flag=True,
+    help="Fit the appearance of each test view to the left half of its photo, as the paper of "
+    "NeRF-W does, and score the right half.",
+)
 @LPIPS_WEIGHTS
 @RUNS_OUT
 @click.option(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from chronoscene.harness.contract.subject import NotApplicableError, Subject, demand, resized
 from chronoscene.harness.contract.tiny_training import periods_for
+from chronoscene.harness.score.regions import left_half
 from chronoscene.harness.train.checks import check_prediction
 from chronoscene.harness.train.painted_balls import VIEWS_PER_PERIOD
 from chronoscene.methods import Prediction, View
@@ -131,6 +132,21 @@ def gaussians_look_like_the_model(subject: Subject) -> None:
         demand(lost < LOST, place, "what changes in render", f"{lost:.0%} of it lost")
 
 
+def half_of_a_photo_fits_the_appearance(subject: Subject) -> None:
+    """An appearance that is fitted to part of a photo reads that alone, and leaves the model."""
+    method, view = subject.loaded(), subject.data.views[0]
+    if not hasattr(method, "fitted_to"):
+        raise NotApplicableError("no appearance belongs to a single photo")
+    photo, known = subject.data.load_image(0), left_half(view.height, view.width)
+    before, images = method.render(view, 0.0).rgb, []
+    for unknown in (photo, 255 - photo):
+        shown = np.where(known[..., None], photo, unknown)
+        images.append(method.fitted_to(view, 0.0, shown, known).render(view, 0.0).rgb)
+    demand(np.array_equal(*images), "fitted_to", "an image that unknown pixels do not change")
+    after = method.render(view, 0.0).rgb
+    demand(np.array_equal(after, before), "fitted_to", "a model that renders what it did")
+
+
 def _image(subject: Subject, period: float) -> NDArray[np.float32]:
     return subject.method.render(subject.data.views[0], period).rgb
 
@@ -143,4 +159,5 @@ CHECKS = (
     periods_matter,
     fractional_periods_lie_between,
     gaussians_look_like_the_model,
+    half_of_a_photo_fits_the_appearance,
 )

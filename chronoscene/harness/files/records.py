@@ -137,6 +137,9 @@ class RunRecord(BaseModel):
     """Options that differ from the preset, such as ``sh_degree=2``."""
     protocol: str = ""
     """Name in `PROTOCOLS` of the protocol that the run was made under, or empty."""
+    fitted: str = ""
+    """Part of each test photo that the appearance was fitted to, such as ``left half``, so that
+    only the rest is scored; or empty."""
     method_version: str
     config_hash: str
     """Hash of everything that decides the result but scene, seed, device and threads."""

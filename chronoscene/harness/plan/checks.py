@@ -92,6 +92,22 @@ def check_stages(run: ResolvedRun) -> None:
         )
 
 
+def check_fitting(run: ResolvedRun) -> None:
+    """Check that the appearance of a method can be fitted to half of a photo.
+
+    Raises:
+        ConfigError: If it cannot.
+    """
+    spec = run.spec
+    if spec.runner is not None or not hasattr(import_object(spec.method), "fitted_to"):
+        raise ConfigError(
+            f"{spec.name} --fit-half",
+            expected="a method whose appearance belongs to single photos",
+            found="one without fitted_to",
+            todo="run it without --fit-half, which scores whole photos",
+        )
+
+
 def check_run(run: ResolvedRun) -> None:
     """Check a run before anything is trained.
 
@@ -108,5 +124,7 @@ def check_run(run: ResolvedRun) -> None:
         )
     if STRATEGIES[job.strategy].in_order:
         check_stages(run)
+    if settings.fit_half:
+        check_fitting(run)
     if spec.runner is not None:
         check_runner(run, spec.runner)

@@ -77,6 +77,8 @@ class ResolvedMethod:
             differ["separate_iterations"] = settings.separate_iterations
         if settings.validation:
             differ["validation"] = True
+        if settings.fit_half:
+            differ["fit_half"] = True
         if settings.protocol:
             differ["protocol"] = settings.protocol
         variant = ",".join(f"{k}={as_typed(v)}" for k, v in differ.items())
@@ -113,6 +115,7 @@ class ResolvedRun:
             "max_width": settings.max_width,
             **({"continued_from": job.continued_from} if job.continued_from else {}),
             **({"validation": True} if settings.validation else {}),
+            **({"fit_half": True} if settings.fit_half else {}),
             **({"protocol": settings.protocol} if settings.protocol else {}),
         }
         decides = json.loads(json.dumps(decides))

@@ -49,6 +49,8 @@ class RunSettings:
     """``auto``, ``cpu`` or ``cuda``."""
     validation: bool = False
     """True if views held back from the training views are scored, and test views are not read."""
+    fit_half: bool = False
+    """True if appearance is fitted to the left half of test photos, and the right half scored."""
     photo_memory: int = PHOTO_MEMORY
     """Bytes that training photos may take in memory, those that are being decoded included."""
     photo_disk: int = PHOTO_DISK

@@ -1,10 +1,11 @@
 """Definition of what may be compared, for tables, figures, trade-offs, studies, leaderboard.
 
-Scores are compared within a *test*: equal scene and photos, test views, width and protocol. Methods
-are ranked on the leaderboard if they had the same *effort* as well: the same time on the same
-device where there was a budget, else as many training steps, those of all models or stages
-together. A preset is no effort: those named ``paper`` have from 18,000 to 40,000 steps. Elsewhere
-efforts may differ, and notes say so. Times are compared on one device only (`TIMES` of `summary`).
+Scores are compared within a *test*: equal scene and photos, test views, width, protocol and part of
+the photos. Methods are ranked on the leaderboard if they had the same *effort* as well: the same
+time on the same device where there was a budget, else as many training steps, those of all models
+or stages together. A preset is no effort: those named ``paper`` have from 18,000 to 40,000 steps.
+Elsewhere efforts may differ, and notes say so. Times are compared on one device only (`TIMES` of
+`summary`).
 What a paper printed is in no test: its photos, test views and hardware are not known to be ours.
 """
 
@@ -24,11 +25,13 @@ KEY = (
 )
 """Fields of `RunRecord` in which the seeds of a configuration agree on one device."""
 _FIELDS = {
-    "width": "max_width", "protocol": "protocol", "split": "split_hash", "scene": "scene_hash"
+    "width": "max_width", "protocol": "protocol", "fitted": "fitted",
+    "split": "split_hash", "scene": "scene_hash",
 }  # fmt: skip
 _MEANING = {
     "width": "--max-width",
     "protocol": "--protocol",
+    "fitted": "--fit-half",
     "split": "test views",
     "scene": "photos, poses or points",
 }
@@ -43,6 +46,7 @@ class Setting(NamedTuple):
     split_hash: str
     max_width: int
     protocol: str
+    fitted: str
     effort: str
 
     @property
@@ -53,7 +57,7 @@ class Setting(NamedTuple):
 
 def setting_of(run: RunRecord) -> Setting:
     """Return the setting of a run."""
-    test = run.scene, run.scene_hash, run.split_hash, run.max_width, run.protocol
+    test = run.scene, run.scene_hash, run.split_hash, run.max_width, run.protocol, run.fitted
     return Setting(*test, effort_of(run))
 
 
@@ -103,7 +107,7 @@ def apart(records: Sequence[RunRecord]) -> list[RunRecord]:
             for run in of_scene.values()
         ]
         differing = [
-            kind for kind in ("width", "protocol", "split") if len({n[kind] for n in names}) > 1
+            kind for kind in _FIELDS if kind != "scene" and len({n[kind] for n in names}) > 1
         ]
         if len({tuple(n[kind] for kind in differing) for n in names}) < len(names):
             differing.append("scene")  # its hash covers the split, too

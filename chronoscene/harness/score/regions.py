@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import (
@@ -34,13 +34,24 @@ from chronoscene.images.truth import changed_at_all, truth_place
 ALL, CHANGED, INVARIANT = REGIONS = ("all", "changed", "invariant")
 
 
-def regions_of(folder: Path, entry: ImageEntry) -> Iterator[tuple[str, NDArray[np.bool_] | None]]:
+def left_half(height: int, width: int) -> Mask:
+    """Return the pixels of the left half of an image. [H, W]"""
+    return np.broadcast_to(np.arange(width) < width // 2, (height, width))
+
+
+def regions_of(
+    folder: Path, entry: ImageEntry, fitted: str = ""
+) -> Iterator[tuple[str, Mask | None]]:
     """Yield names and masks of the regions of a view; None for all pixels. [H, W]
 
     A pixel is *changed* if it differs from at least one other period, and *invariant* if it is the
-    same in all of them. Pixels that the mask of the photo ignores are in no region.
+    same in all of them. Pixels that the mask of the photo ignores are in no region, nor are those
+    that an appearance was fitted to (`RunRecord.fitted`).
     """
     mask, changed = load_mask(folder, entry), load_changed(folder, entry)
+    if fitted:
+        right = ~left_half(entry.height, entry.width)
+        mask = right if mask is None else mask & right
     yield ALL, mask
     if changed is not None:
         counted = True if mask is None else mask

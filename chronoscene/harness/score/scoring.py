@@ -54,7 +54,12 @@ class Scores:
 
 
 def score_folder(
-    predictions: Path, ground_truth: Path, scorers: Scorers, *, stage: bool = False
+    predictions: Path,
+    ground_truth: Path,
+    scorers: Scorers,
+    *,
+    fitted: str = "",
+    stage: bool = False,
 ) -> Scores:
     """Score every predicted view that shows the period of its photo.
 
@@ -62,6 +67,7 @@ def score_folder(
         predictions: Predictions of a run, or of one of its stages.
         ground_truth: The frozen photos.
         scorers: The metrics.
+        fitted: As `RunRecord.fitted`.
         stage: Accept missing views, and views that show the last known period.
 
     Raises:
@@ -74,7 +80,7 @@ def score_folder(
     for entry, target in pairs:
         image, reference = load_image(predictions, entry), load_image(ground_truth, target)
         periods = entry.camera_period, entry.rendered_period
-        for region, mask in regions_of(ground_truth, target):
+        for region, mask in regions_of(ground_truth, target, fitted):
             if mask is not None and not mask.any():
                 if region == ALL:
                     unscored.append(entry.view)
@@ -108,7 +114,7 @@ def put_scores(record: RunRecord, scores: Scores) -> None:
 
 def score_run(staging: Path, record: RunRecord, truth: Path, scorers: Scorers) -> None:
     """Score the predictions in the folder of a run, and write its record."""
-    scores = score_folder(staging / PREDICTIONS, truth, scorers)
+    scores = score_folder(staging / PREDICTIONS, truth, scorers, fitted=record.fitted)
     put_scores(record, scores)
     score_stages(staging, record, truth, scorers)
     if scores.unscored:
@@ -127,7 +133,8 @@ def score_stages(folder: Path, record: RunRecord, truth: Path, scorers: Scorers)
     stages: dict[str, dict[str, Values]] = {}
     *names, last = UNTRAINED, *map(period_part, range(len(record.period_labels)))
     for name in names if (folder / STAGES).is_dir() else ():
-        scores = score_folder(folder / STAGES / name, truth, scorers, stage=True)
+        predictions = folder / STAGES / name
+        scores = score_folder(predictions, truth, scorers, fitted=record.fitted, stage=True)
         _, stages[name] = aggregate(scores.rows)
         for period, earlier in record.stages.get(name, {}).items():
             stages[name][period] = earlier | stages[name].get(period, {})
@@ -310,7 +317,7 @@ def _rescore_one(runs: Path, folder: Path, scorers: Scorers) -> Rescored:
         record = read_run(folder)
         before, parts = record.aggregates, record.regions
         truth = ground_truth_folder(runs, record.scene)
-        scores = score_folder(folder / PREDICTIONS, truth, scorers)
+        scores = score_folder(folder / PREDICTIONS, truth, scorers, fitted=record.fitted)
         kept, scores = keep_earlier(folder, record, scores, scorers.unasked)
         put_scores(record, scores)
         score_stages(folder, record, truth, scorers)

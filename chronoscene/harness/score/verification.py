@@ -266,7 +266,7 @@ def _score_again(
     if run.unchecked and not functions:
         run.absent.append(f"{folder}: no metric that can be computed here")
     known = Scorers(functions, {})
-    scores = score_folder(folder / PREDICTIONS, truth, known)
+    scores = score_folder(folder / PREDICTIONS, truth, known, fitted=record.fitted)
     # Regions may have been scored by some of the metrics only.
     parts = {(row.region, row.metric) for row in record.rows}
     parts |= {(ALL, name) for name in recorded}

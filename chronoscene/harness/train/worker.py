@@ -37,6 +37,7 @@ from chronoscene.harness.plan.memory import open_store
 from chronoscene.harness.plan.parts import Part, make_parts
 from chronoscene.harness.plan.resolve import ResolvedRun, resolve
 from chronoscene.harness.plan.stop import StopRule
+from chronoscene.harness.score.regions import left_half
 from chronoscene.harness.score.scoring import NO_TESTS, score_job
 from chronoscene.harness.train.checkpoints import Checkpoints, LoopState
 from chronoscene.harness.train.checks import check_sharing
@@ -193,6 +194,16 @@ def _render_view(
     return seconds, prediction.drawn
 
 
+def _fitted(method: Method, job: Job, part: Part, frame: Frame) -> Method:
+    """Return a model with its appearance fitted to the left half of the photo of a test view."""
+    folder = ground_truth_folder(job.settings.runs, job.scene)
+    (entry,) = (e for e in read_manifest(folder).images if e.view == frame.name)
+    known, mask = left_half(entry.height, entry.width), load_mask(folder, entry)
+    known = known if mask is None else known & mask
+    photo, view, period = load_image(folder, entry), part.view(frame), part.method_period(frame)
+    return method.fitted_to(view, period, photo, known)
+
+
 def _run_part(
     run: ResolvedRun,
     method: Method,
@@ -229,7 +240,8 @@ def _run_part(
     seconds = 0.0
     drawn: list[Any] = []
     for frame in part.test:
-        spent, touching = _render_view(loaded, part, frame, writer)
+        shown = _fitted(loaded, run.job, part, frame) if run.job.settings.fit_half else loaded
+        spent, touching = _render_view(shown, part, frame, writer)
         seconds += spent
         drawn.append(touching)
     for frame in part.ahead:
@@ -328,6 +340,7 @@ def _record(
         preset=job.settings.preset_name,
         variant=job.variant,
         protocol=job.settings.protocol,
+        fitted="left half" if job.settings.fit_half else "",
         method_version=method_version(job.origin.method),
         config_hash=run.document["config_hash"],
         scene_hash=job.scene_hash,

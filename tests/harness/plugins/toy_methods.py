@@ -63,6 +63,12 @@ class MeanColour:
         rgb[:] = self.colors[int(period)]
         return Prediction(rgb)
 
+    def fitted_to(self, view, period, photo, known):
+        fitted = type(self)(self.config)
+        fitted.colors = self.colors.copy()
+        fitted.colors[int(period)] = photo[known].mean(axis=0) / 255.0
+        return fitted
+
     def save(self, folder):
         (folder / "model.json").write_text(json.dumps({"colors": self.colors.tolist()}))
 

@@ -18,6 +18,7 @@ def test_methods_with_the_same_preset_are_compared():
         {"scene_hash": "other"},
         {"split_hash": "other"},
         {"max_width": 800},
+        {"fitted": "left half"},
         {"iterations": 7},
         {"iterations": None},
         {"variant": "budget=90s"},

@@ -18,6 +18,8 @@ from chronoscene.harness.report.figures.comparison import draw_figures
 from chronoscene.harness.report.summary import read_runs
 from chronoscene.harness.report.tables import format_runs
 from chronoscene.harness.run import runner
+from chronoscene.harness.score.scoring import rescore
+from chronoscene.metrics.registry import make_scorers
 
 FIELDS = {
     "method",
@@ -101,6 +103,19 @@ def test_a_method_has_its_own_strategy_unless_another_is_asked_for(bench_here):
     asked, _ = bench_here("MEAN", "CONTINUAL", iterations=4, strategies=("pooled", "joint"))
     strategies = [[read_run(folder).strategy for folder in made.finished] for made in (own, asked)]
     assert strategies == [["joint", "sequential"], ["pooled", "joint", "pooled", "joint"]]
+
+
+def test_half_of_each_photo_gives_the_appearance_and_the_other_is_scored(bench_here, tmp_path):
+    whole, _ = bench_here("MEAN", iterations=4)
+    half, _ = bench_here("MEAN", iterations=4, fit_half=True)
+    (folder,) = half.finished
+    assert folder.parent.name == "mean-joint-balanced-iterations=4,fit_half=true"
+    run = read_run(folder)
+    assert run.fitted == "left half"
+    assert run.aggregates["macro"]["psnr"] > read_run(whole.finished[0]).aggregates["macro"]["psnr"]
+    assert not any(again.changes for again in rescore(tmp_path / "runs", make_scorers()))
+    with pytest.raises(ConfigError, match="fixed --fit-half: expected a method whose appearance"):
+        bench_here("FIXED", fit_half=True)
 
 
 def test_failures_stop_nobody_else(finished_bench):

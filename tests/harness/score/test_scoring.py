@@ -109,6 +109,18 @@ def test_what_a_mask_ignores_is_not_scored(tmp_path):
         assert found["b.png", name] == function(guess["b.png"], photo)
 
 
+def test_the_half_that_was_fitted_to_is_not_scored(tmp_path):
+    guess, photo, scorers = noise(0), noise(2), make_scorers(["psnr", "ssim"])
+    truth = write(tmp_path / "t", {"a.png": photo}, masks={"a.png": MASK})
+    right = MASK & (np.arange(13) >= 6)
+    for k, changed in enumerate((guess, np.where(right[..., None], guess, 0))):
+        predictions = write(tmp_path / f"p{k}", {"a.png": changed})
+        scores = score_folder(predictions, truth, scorers, fitted="left half")
+        outside = np.where(right[..., None], guess, photo)
+        for row in scores.rows:
+            assert row.value == scorers.functions[row.metric](outside, photo, right)
+
+
 def test_views_of_which_nothing_counts_have_no_values(tmp_path):
     images, nothing = {"a.png": noise(0), "b.png": noise(1)}, np.zeros((12, 13), bool)
     predictions, scorers = write(tmp_path / "p", images), make_scorers(["psnr", "ssim"])
