@@ -67,9 +67,13 @@ def views_hash(views: Iterable[tuple[str, int]]) -> str:
 
 
 def role_of(digest: str) -> str:
-    """Describe the role of the scene with a `scene_hash`."""
-    roles = {scene.scene_hash: ROLES[scene.role] for scene in fixed_scenes().values()}
-    return roles.get(digest, "a scene without a role in the table of scenes")
+    """Return the role of the scene with a `scene_hash`, or nothing."""
+    return {scene.scene_hash: scene.role for scene in fixed_scenes().values()}.get(digest, "")
+
+
+def meaning_of(role: str) -> str:
+    """Describe a role for a reader."""
+    return ROLES.get(role, "a scene without a role in the table of scenes")
 
 
 def make(folder: Path, fixed: FixedScene, photos: Path | None = None) -> None:

@@ -21,6 +21,7 @@ from chronoscene.io.staging import staged_folder
 from leaderboard.board import Standing
 from leaderboard.pictures import find_runs, gallery
 from leaderboard.registry import command_of, spec_of, title_of
+from leaderboard.scenes import role_of
 from leaderboard.tables import (
     CLAIMED,
     PRINTED_COLUMNS,
@@ -33,8 +34,13 @@ from leaderboard.tables import (
     row_order,
 )
 
-OTHER_SCENES = "Other scenes"
-PARTS = {"real": "Real scenes of the paper", "synthetic": "Synthetic scenes of the paper"}
+PARTS = {
+    "ranking": "Ranking scenes, which no trial of a preset has used",
+    "": "Other scenes",
+    "real": "Real scenes of the paper",
+    "synthetic": "Synthetic scenes of the paper",
+}
+"""Titles of the tables of the first page, in their order."""
 
 
 def write_site(
@@ -72,7 +78,8 @@ class _Site:
         everything = [record for standing in standings for record in standing.records]
         printed = published_entries(published, dict.fromkeys(row.scene for row in published.rows))
         self.printed = printed.assign(method=printed.method.map(published.methods))
-        self.parts = {row.scene: row.group for row in published.rows}
+        self.parts = {r.scene: "ranking" for r in everything if role_of(r.scene_hash) == "ranking"}
+        self.parts |= {row.scene: row.group for row in published.rows}
         self.scenes = _file_names(dict.fromkeys([*(r.scene for r in everything), *self.parts]))
         measured = sorted({record.method for record in everything})
         self.colors = dict(zip(measured, period_colors(len(measured)), strict=True))
@@ -112,16 +119,17 @@ class _Site:
 
     def _parts(self) -> Iterator[dict[str, Any]]:
         """Yield tables of the first page: PSNR of methods by scenes, one per part of a dataset."""
-        groups = {self.parts.get(scene, "") for scene in self.scenes}
-        for group in sorted(groups):  # other scenes, which were measured, come first
+        for group, title in PARTS.items():
             scenes = [scene for scene in self.scenes if self.parts.get(scene, "") == group]
+            if not scenes:
+                continue
             kinds = {kind: self._by_effort(kind, scenes) for kind in self.groups}
             printed: dict[str, dict[str, Any]] = {}
             psnr = self.printed[self.printed.quantity == "psnr"]
             for row in psnr[psnr.scene.isin(scenes)].itertuples():
                 printed.setdefault(row.method, {})[row.scene] = make_cell(row)
             yield {
-                "title": PARTS.get(group, group) or OTHER_SCENES,
+                "title": title,
                 "scenes": scenes,
                 "measured": {kind: efforts for kind, efforts in kinds.items() if efforts},
                 "published": printed,

@@ -20,7 +20,7 @@ from chronoscene.harness.report.summary import (
 from chronoscene.harness.report.tables import period_title
 from chronoscene.metrics.registry import metric_info
 from leaderboard.pareto import Point, plot
-from leaderboard.scenes import role_of
+from leaderboard.scenes import meaning_of, role_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -88,7 +88,7 @@ def make_group(
         "setting": setting,
         "plots": _plots(parts[VERIFIED], legend, times, quality) if ranked else [],
         "legend": legend,
-        "role": role_of(setting.scene_hash),
+        "role": meaning_of(role_of(setting.scene_hash)),
         "devices": list(dict.fromkeys(run.device for run in runs)),
         "commits": list(dict.fromkeys(short_commits(run.commit) for run in runs)),
     }

@@ -12,7 +12,7 @@ from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.scene.splits import split_hash
 from chronoscene.synth import SynthSettings, preset
 from leaderboard import scenes
-from leaderboard.scenes import ROLES, FixedScene, fixed_scenes, main, make, role_of
+from leaderboard.scenes import ROLES, FixedScene, fixed_scenes, main, make, meaning_of, role_of
 
 TABLE = fixed_scenes()
 
@@ -38,8 +38,8 @@ def test_the_page_of_scenes_has_their_hashes():
 
 
 def test_roles_are_told_by_hash():
-    assert "no trial" in role_of(TABLE["ranking-aerial"].scene_hash)
-    assert "without a role" in role_of("0" * 64)
+    assert "no trial" in meaning_of(role_of(TABLE["ranking-aerial"].scene_hash))
+    assert "without a role" in meaning_of(role_of("0" * 64))
 
 
 @pytest.fixture
