@@ -16,7 +16,6 @@ from made_runs import write_scored
 from chronoscene.errors import CheckpointError, SceneError
 from chronoscene.harness.files.predictions import read_manifest, write_manifest
 from chronoscene.harness.report.published import load_published
-from leaderboard import site
 from leaderboard.board import NOT_ASKED, read_board
 from leaderboard.scenes import FixedScene, views_hash
 from leaderboard.site import write_site
@@ -223,7 +222,7 @@ def test_pages_say_what_is_of_older_code_and_the_role_of_a_scene(make_run, enter
 def test_ranking_scenes_have_a_table_of_their_own(make_run, enter, tmp_path, monkeypatch):
     enter([make_run()], tmp_path / "e")
     for role, title in (("", "Other scenes"), ("ranking", "Ranking scenes, which")):
-        monkeypatch.setattr(site, "role_of", lambda digest, role=role: role)
+        monkeypatch.setattr("leaderboard.site.role_of", lambda digest, role=role: role)
         write_site(standings(tmp_path / "e"), load_published(), tmp_path / f"site{role}")
         text = (tmp_path / f"site{role}/index.html").read_text(encoding="utf-8")
         assert [t for t in ("Other scenes", "Ranking scenes, which") if t in text] == [title]
