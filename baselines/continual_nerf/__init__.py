@@ -25,6 +25,7 @@ _COMMON: dict[str, Any] = {
     "strategy": "sequential",
     "per_period": ("paper",),
     "mixes_views": True,
+    "draws_gaussians": False,
     "learns_background": True,
     "resumable": True,
     "main_options": (

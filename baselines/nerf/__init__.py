@@ -34,6 +34,7 @@ _COMMON: dict[str, Any] = {
     "devices": ("cpu", "cuda"),
     "config": "baselines.nerf.config:NerfConfig",
     "mixes_views": True,
+    "draws_gaussians": False,
     "learns_background": True,
     "resumable": True,
     "main_options": (

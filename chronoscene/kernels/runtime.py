@@ -107,8 +107,12 @@ def keep_freed_memory() -> bool:
     )
 
 
-def check_device(device: str) -> None:
+def check_device(device: str, *, gsplat: bool = True) -> None:
     """Check on the machine that will train that it has the device.
+
+    Args:
+        device: ``cpu``, ``cuda`` or ``auto``.
+        gsplat: Whether a GPU needs the package.
 
     Raises:
         BackendError: If a GPU is asked for that is not there, or its kernels are not.
@@ -124,4 +128,5 @@ def check_device(device: str) -> None:
             found=f"torch {torch.__version__} without one",
             todo="use --device cpu",
         )
-    gsplat_release()
+    if gsplat:
+        gsplat_release()

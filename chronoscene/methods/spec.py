@@ -115,6 +115,8 @@ class MethodSpec:
     per_period: tuple[str, ...] = ()
     """Presets whose iterations are those of each period: each stage of ``sequential`` and each
     model of ``separate`` has all of them, and a model of several periods as often as many."""
+    draws_gaussians: bool = True
+    """False if it works on a GPU without gsplat."""
     resumable: bool = False
     """True if it has `Method.save_training` and `Method.load_training`."""
     main_options: tuple[str, ...] = ()

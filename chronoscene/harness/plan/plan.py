@@ -38,7 +38,8 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     shared = settings.run
     methods = resolve_methods(settings.methods, shared)
     if settings.ray is None:  # else the machine that runs a job checks its own
-        check_device(shared.device)
+        gsplat = any(method.spec.draws_gaussians for method in methods)
+        check_device(shared.device, gsplat=gsplat)
     runs: dict[Path, ResolvedRun] = {}
     todo: dict[Path, ResolvedRun] = {}
     for scene in read_scenes(settings, log):

@@ -153,13 +153,13 @@ def pick_device(wanted: str, spec: MethodSpec) -> str:
     Raises:
         BackendError: If a GPU is asked for that is not there.
     """
-    check_device(wanted)
+    check_device(wanted, gsplat=spec.draws_gaussians)
     if wanted != "auto":
         return wanted
     if "cuda" not in spec.devices or "cpu" not in spec.devices:
         return spec.devices[0]
     with suppress(BackendError):
-        check_device("cuda")
+        check_device("cuda", gsplat=spec.draws_gaussians)
         return "cuda"
     return "cpu"
 

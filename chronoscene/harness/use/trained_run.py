@@ -358,7 +358,6 @@ def open_run(
             stage.
         BackendError: If there is no such device.
     """
-    check_device(device)
     folder = Path(folder)
     record = read_run(folder)
     if stage is not None:
@@ -379,6 +378,7 @@ def open_run(
             found=f"one of {spec.title}, which is another program",
             todo=f"open the files in its folder {CHECKPOINT} with that program",
         )
+    check_device(device, gsplat=spec.draws_gaussians)
     return TrainedRun(
         folder=folder,
         record=record,

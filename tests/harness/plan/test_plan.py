@@ -49,7 +49,7 @@ def test_planning_builds_each_configuration_once(scene_folder, tmp_path, monkeyp
 def test_a_bench_on_a_gpu_begins_with_what_each_method_takes_of_its_memory(
     scene_folder, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(planning, "check_device", lambda device: None)
+    monkeypatch.setattr(planning, "check_device", lambda device, gsplat: None)
     for device, expected in (("cuda", ["chronogs", "3dgs"]), ("cpu", []), ("auto", [])):
         settings = bench_settings(
             (scene_folder,), ("chronogs", "3dgs"), tmp_path / device, seeds=(0, 1), device=device

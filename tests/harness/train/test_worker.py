@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene.errors import BackendError
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.harness.files.records import read_run
 from chronoscene.harness.report.summary import read_runs
 from chronoscene.harness.report.tables import format_runs
+from chronoscene.harness.train.worker import pick_device
 from chronoscene.methods import load_spec, method_names
 from chronoscene.training import photometric
 from chronoscene.training.checkpoint import load_tensors
@@ -126,3 +128,13 @@ def test_a_training_that_diverges_keeps_its_last_good_model(tmp_path, bench_here
     assert "the model of iteration 7 is kept in checkpoint" in outcome.failures[0].reason
     (kept,) = (tmp_path / "runs").rglob("checkpoint")
     assert all(tensor.isfinite().all() for tensor in load_tensors(kept)[0].values())
+
+
+def test_a_gpu_without_gsplat_serves_fields(monkeypatch, set_gsplat):
+    """Methods with Gaussians take the CPU there, unless the GPU is asked for."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    set_gsplat(None)
+    assert [pick_device("auto", load_spec(name)) for name in ("clnerf", "3dgs")] == ["cuda", "cpu"]
+    assert pick_device("cuda", load_spec("neusc")) == "cuda"
+    with pytest.raises(BackendError, match="gsplat: expected version 1.5 or 1.6, found none"):
+        pick_device("cuda", load_spec("chronogs"))
