@@ -25,7 +25,7 @@ _PIXEL_FREQUENCIES = 10
 _MASK_CODE = 128
 _MASK_HIDDEN = 64
 _FIT_STEPS, _FIT_RAYS, _FIT_RATE = 60, 256, 0.02
-"""Of the fit of a light to a test photo."""
+"""Steps, rays of a step and learning rate of the fit of a light to a test photo."""
 
 
 class Nerf(FieldMethod):

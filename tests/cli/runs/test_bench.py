@@ -168,7 +168,7 @@ def test_defaults(settings, make_scene_folder):
     asked = settings(str(scene), "--method", "chronogs")
     assert [found.path for found in asked.scenes] == [scene]
     assert asked.methods == ("chronogs",)
-    assert asked.strategies == ("joint",) and asked.run.preset == "balanced"
+    assert asked.strategies == () and asked.run.preset == "balanced"
     assert (
         asked.seeds == (0,)
         and asked.run.runs == Path("runs").resolve()

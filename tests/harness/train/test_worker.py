@@ -28,7 +28,8 @@ def test_a_photo_that_shows_nothing_is_an_empty_step(make_scene, tmp_path, bench
     turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ blind.cam_from_world
     frames = tuple(replace(f, cam_from_world=turned) if f is blind else f for f in scene.frames)
     folder = scene_format.write(replace(scene, frames=frames), tmp_path / "ring")
-    outcome, _ = bench_here(method, scenes=(folder,), preset="fast", iterations=15)
+    options = {"strategies": ("joint",), "preset": "fast", "iterations": 15}
+    outcome, _ = bench_here(method, scenes=(folder,), **options)
     assert outcome.failures == ()
     record = read_run(outcome.finished[0])
     assert (record.iterations, record.empty_steps, record.skipped_steps) == (15, 3, 0)

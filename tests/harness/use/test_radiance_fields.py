@@ -63,6 +63,7 @@ def trained_fields(
                 scenes=(scene_folder,),
                 methods=tuple(METHODS),
                 runs=folder / "runs",
+                strategies=("joint",),
                 preset="fast",
                 iterations=24,
                 overrides=overrides,
