@@ -55,6 +55,11 @@ class ImageCase:
     """True if the last period shows another city, so that nothing can be right. It is mirrored,
     because the textures of all cities are alike."""
 
+    @property
+    def folder(self) -> str:
+        """Name of the folder of its scene and photos."""
+        return self.name.replace(", ", "-").replace(" ", "_")
+
 
 CASES = (
     ImageCase("two periods", 31),
@@ -82,7 +87,7 @@ def run_images(options: argparse.Namespace) -> list[shared.Outcome]:
     routes = shared.ROUTES if options.route == "all" else (options.route,)
     with shared.work_folder(options.work) as work:
         for case in [c for c in CASES if options.only in c.name][: options.cases]:
-            folder = work / case.name.replace(", ", "-").replace(" ", "_")
+            folder = work / case.folder
             truth = make_photos(case, folder)
             outcomes += [_run_case(case, folder, truth, route) for route in routes]
     return outcomes

@@ -75,6 +75,13 @@ def read_periods(source: Path) -> dict[str, str]:
     return periods
 
 
+def write_table(periods: dict[str, str], table: Path) -> Path:
+    """Write the table of periods that ``register --table`` takes; return its path."""
+    rows = "".join(f"{file},{label}\n" for file, label in sorted(periods.items()))
+    table.write_text(f"image,period\n{rows}", encoding="utf-8")
+    return table
+
+
 def _compare(
     source: Path,
     folder: Path,
@@ -131,9 +138,7 @@ def _run(
 ) -> Registered:
     """One run of the command on some of the photos, with features and matches of its own."""
     folder.mkdir(parents=True, exist_ok=True)
-    table = folder / f"{name}.csv"
-    rows = "".join(f"{file},{label}\n" for file, label in sorted(periods.items()))
-    table.write_text(f"image,period\n{rows}", encoding="utf-8")
+    table = write_table(periods, folder / f"{name}.csv")
     captures = read_captures(source / "images", table=table)
     options = shared.options_for(folder / f"work-{name}", route)
     return run(captures, folder / name, options, inspected=found.append)

@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.registration import outcomes as shared
 from benchmarks.registration.generated import pose_errors
 from benchmarks.registration.images import CASES, make_photos
-from benchmarks.registration.photos import read_periods
+from benchmarks.registration.photos import read_periods, write_table
 from chronoscene.arrays import Array
 from chronoscene.formats import read_scene
 from chronoscene.harness.files.provenance import code_version, processor_name
@@ -37,7 +37,7 @@ COMMAND = "from chronoscene.cli import main; main()"
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """What one command gave."""
+    """Outcome of one command."""
 
     seconds: float
     """CPU time of the command and of all its processes."""
@@ -70,11 +70,10 @@ def register(checkout: Path, captures: Path, table: Path | None, out: Path) -> R
         print(f"  {out.name}: {done.stderr.strip().splitlines()[-1:]}", flush=True)
         return Registration(seconds, shared.REFUSED, {}, frozenset())
     document = json.loads((out / "registration.json").read_text(encoding="utf-8"))
-    verdict = document.get("alignment", document)["verdict"]
     frames = read_scene(out).frames
     return Registration(
         seconds,
-        verdict if isinstance(verdict, str) else verdict["level"],
+        document.get("alignment", document)["verdict"],
         {Path(f.name).name: f.cam_from_world for f in frames},
         frozenset(Path(f.name).name for f in frames if f.period == 0),
     )
@@ -120,7 +119,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("other", type=Path)
     parser.add_argument("photos", type=Path, nargs="*")
-    parser.add_argument("--only", help="rendered cities whose name has this in it; none: without")
+    parser.add_argument("--only", default="", help="rendered cities with this in their names")
     parser.add_argument("--work", type=Path)
     given = parser.parse_args()
     print(f"{processor_name()}, one thread, {code_version()}; photos, errors, verdict\n")
@@ -132,12 +131,10 @@ def main() -> None:
         for source in given.photos:
             folder = work / source.name
             folder.mkdir(parents=True, exist_ok=True)
-            rows = "".join(f"{f},{p}\n" for f, p in sorted(read_periods(source).items()))
-            table = folder / "periods.csv"
-            table.write_text(f"image,period\n{rows}", encoding="utf-8")
+            table = write_table(read_periods(source), folder / "periods.csv")
             compare(checkouts, folder, source.resolve() / "images", table)
-        for case in (c for c in CASES if given.only in (None, c.name) or given.only in c.name):
-            folder = work / case.name.replace(", ", "-").replace(" ", "_")
+        for case in (c for c in CASES if given.only in c.name):
+            folder = work / case.folder
             truth = make_photos(case, folder)
             compare(checkouts, folder, folder / "photos", truth=truth)
 

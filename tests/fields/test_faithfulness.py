@@ -1,4 +1,4 @@
-"""What each method must be able to do, and what it cannot, on painted balls at views held back."""
+"""Abilities and limits of each method, on painted balls."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def error_of_change(name: str, *, removed: bool) -> float:
 
 
 def test_neusc_repaints_surfaces() -> None:
-    """As well as a field whose densities know the date."""
+    """A field whose densities know the date is hardly better at it."""
     assert error_of_change("neusc", removed=False) < 1.2 * error_of_change("clnerf", removed=False)
 
 

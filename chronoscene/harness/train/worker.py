@@ -10,7 +10,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
 from datetime import UTC, datetime
@@ -194,14 +194,23 @@ def _render_view(
     return seconds, prediction.drawn
 
 
-def _fitted(method: Method, job: Job, part: Part, frame: Frame) -> Method:
-    """Return a model with its appearance fitted to the left half of the photo of a test view."""
+def _shown(method: Method, job: Job, part: Part) -> Iterator[tuple[Frame, Method]]:
+    """Yield the test views of a part, and the model that renders each.
+
+    That is the trained one, or with `RunSettings.fit_half` one whose appearance is fitted to the
+    left half of the photo.
+    """
+    if not job.settings.fit_half:
+        yield from ((frame, method) for frame in part.test)
+        return
     folder = ground_truth_folder(job.settings.runs, job.scene)
-    (entry,) = (e for e in read_manifest(folder).images if e.view == frame.name)
-    known, mask = left_half(entry.height, entry.width), load_mask(folder, entry)
-    known = known if mask is None else known & mask
-    photo, view, period = load_image(folder, entry), part.view(frame), part.method_period(frame)
-    return method.fitted_to(view, period, photo, known)
+    entries = {entry.view: entry for entry in read_manifest(folder).images}
+    for frame in part.test:
+        entry = entries[frame.name]
+        known, mask = left_half(entry.height, entry.width), load_mask(folder, entry)
+        known = known if mask is None else known & mask
+        photo, period = load_image(folder, entry), part.method_period(frame)
+        yield frame, method.fitted_to(part.view(frame), period, photo, known)
 
 
 def _run_part(
@@ -239,8 +248,7 @@ def _run_part(
         loaded.render(part.view(frame), part.method_period(frame))  # the first time takes longer
     seconds = 0.0
     drawn: list[Any] = []
-    for frame in part.test:
-        shown = _fitted(loaded, run.job, part, frame) if run.job.settings.fit_half else loaded
+    for frame, shown in _shown(loaded, run.job, part):
         spent, touching = _render_view(shown, part, frame, writer)
         seconds += spent
         drawn.append(touching)
