@@ -115,6 +115,7 @@ class _Encode(torch.autograd.Function):
         out = torch.zeros(int(ctx.levels[1][-1]), FEATURES)
         given = grads[0].contiguous().view(-1).numpy()
         by_level = np.empty(len(given) + 2 * LANES, np.float32)
+        by_level[len(given) :] = 0  # read beside the last gradients, where a nan would hide them
         rest = numba.get_num_threads(), by_level, out.view(-1).numpy()
         encode_backward(*ctx.given, given, *ctx.levels, *rest)
         return out, None, None
