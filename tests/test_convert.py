@@ -183,8 +183,8 @@ def test_progress_counts_images(make_scene_folder, tmp_path):
 
 def test_unknown_target_and_grouping(make_scene_folder, tmp_path):
     folder = make_scene_folder()
-    with pytest.raises(ConfigError, match="nerfstudio, wat, found 'neusc'"):
-        convert(folder, tmp_path / "out", target="neusc")
+    with pytest.raises(ConfigError, match="nerfstudio, neusc, wat, found 'matrixcity'"):
+        convert(folder, tmp_path / "out", target="matrixcity")
     with pytest.raises(ConfigError, match="which defines its own periods"):
         convert(folder, tmp_path / "out", period_by="year")
 

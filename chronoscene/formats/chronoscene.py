@@ -222,10 +222,12 @@ def check_writable_name(place: Path, frame: Frame) -> None:
         )
 
 
-def write_texts(scene: Scene, root: Path, texts: Collection[str] = TEXTS) -> None:
+def write_texts(
+    scene: Scene, root: Path, texts: Collection[str] = TEXTS, *, model: str = MODEL
+) -> None:
     """Write the model and some texts of the format, all but the images, into an existing folder."""
-    (root / MODEL).mkdir(parents=True)
-    write_model(root / MODEL, scene.frames, scene.points)
+    (root / model).mkdir(parents=True)
+    write_model(root / model, scene.frames, scene.points)
     tests = [f.name for f in scene.frames if f.split == "test"]
     files = {
         SPLIT: splits.format_split_text({f.name: f.period for f in scene.frames}),
@@ -234,4 +236,5 @@ def write_texts(scene: Scene, root: Path, texts: Collection[str] = TEXTS) -> Non
         WORLD: json.dumps(world_item(scene.world)) + "\n",
     }
     for name in texts:
+        (root / name).parent.mkdir(exist_ok=True)
         (root / name).write_text(files[name], encoding="utf-8", newline="\n")

@@ -20,7 +20,6 @@ from pathlib import Path
 
 from chronoscene.colmap.model import PosedImage
 from chronoscene.colmap.raw_model import FoundModel
-from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared import colmap_layout, transforms
 from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
@@ -28,8 +27,8 @@ from chronoscene.formats.shared.ply import read_points
 from chronoscene.formats.shared.transforms import CameraTable
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.io.documents import read_json_document
-from chronoscene.scene import Camera, Points, Scene
-from chronoscene.scene.cameras import PINHOLE_MODELS, as_pinhole
+from chronoscene.scene import Points, Scene
+from chronoscene.scene.cameras import PINHOLE_MODELS
 from chronoscene.scene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
 
 NAME = "cl-splats"
@@ -142,27 +141,14 @@ def write(
 
     Images are directly in ``images/``, and their names begin with ``day_<period>_``.
     """
+    readable = partial(colmap_layout.readable_camera, models=PINHOLE_MODELS, loader="CL-Splats")
     return colmap_layout.write_renamed(
-        scene.with_frames([replace(f, camera=_readable(f.camera)) for f in scene.frames]),
+        scene.with_frames([replace(f, camera=readable(f.camera)) for f in scene.frames]),
         Path(out),
         _written_names(scene),
         texts=(our_format.PERIODS, our_format.WORLD),
         image_source=image_source,
         progress=progress,
-    )
-
-
-def _readable(camera: Camera) -> Camera:
-    """Return the same camera in a model that the loader reads."""
-    if camera.model in PINHOLE_MODELS:
-        return camera
-    if camera.is_pinhole:
-        return as_pinhole(camera)
-    raise SceneError(
-        f"camera {camera.camera_id}",
-        expected=f"a camera that CL-Splats reads: {', '.join(PINHOLE_MODELS)}",
-        found=camera.model,
-        todo="run chronoscene undistort first",
     )
 
 

@@ -8,6 +8,9 @@ The authors publish no list of test images; the evaluation in their configuratio
 image of ``train.txt``. We take the images 0, 10, 20, ... of that list (else of all in name order)
 for testing, and train on none of them.
 
+Where ``sparse/periods.json`` and ``sparse/world.json`` of our format are there, which `write` adds,
+labels and dates of the years come from the first, and unit and reference system from the second.
+
 Cameras come from the COLMAP model. ``annots/cam_dict.npy`` has them too, but it is a pickle, which
 can run any code when it is loaded: it is never opened.
 
@@ -18,14 +21,19 @@ Source: Lin et al., Neural Scene Chronology, CVPR 2023; layout as in ``zju3dv/Ne
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from datetime import date
+from functools import partial
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from chronoscene.colmap.model import Model
 from chronoscene.colmap.raw_model import find_model
 from chronoscene.errors import SceneError
+from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_dates
+from chronoscene.images.store import ImageSource, Progress
 from chronoscene.io.documents import read_text
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import NameIndex, parse_test_text
@@ -37,6 +45,11 @@ PERIOD_BY = ("year", "month", "day", "gap:DAYS", "count:N")
 """Rules by which dates become periods; by year by default."""
 
 TEST_EVERY = 10
+
+PLACE = ("dense/sparse", "dense/images")
+"""Folders of the model and of the images."""
+
+_DAY = re.compile("([0-9]{4})-([0-9]{1,2})-([0-9]{1,2})")
 
 LISTS = ("annots", "")
 """Folders where the lists may be: the scripts write to the second and read from the first."""
@@ -63,15 +76,71 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
             todo="name images with their dates in train.txt, and not in trash.txt",
         )
     dated = [name for name in used if name in dates]
-    return colmap_layout.make_scene(
+    scene = colmap_layout.make_scene(
         path,
-        path / "dense/images",
+        path / PLACE[1],
         colmap_layout.keep_images(model, dates.keys()),
         group_dates(dates, period_by),
         set(dated[::TEST_EVERY]),
         rule=f"every {TEST_EVERY}th image of the list (index 0, {TEST_EVERY}, ...)",
         format=NAME,
     )
+    if period_by == PERIOD_BY[0] and (path / our_format.PERIODS).exists():
+        scene = replace(scene, periods=our_format.read_periods(path, scene.num_periods))
+    return replace(scene, world=our_format.read_world(path))
+
+
+def write(
+    scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
+) -> Path:
+    """Write a scene for the scripts of NeuSC.
+
+    Names of images begin with the day of their period, the first one of a year or month. Where
+    periods are not in different years, one after the other, they become the years 1, 2, ...
+    ``annots/train.txt`` lists all images by name. What the scripts make of the model themselves
+    (``annots/cam_dict.npy``, semantic maps) is not written.
+    """
+    names = _written_names(scene)
+    readable = partial(colmap_layout.readable_camera, models=("PINHOLE",), loader="NeuSC")
+    return colmap_layout.write_renamed(
+        scene.with_frames([replace(f, camera=readable(f.camera)) for f in scene.frames]),
+        Path(out),
+        names,
+        texts=(our_format.PERIODS, our_format.WORLD),
+        image_source=image_source,
+        progress=progress,
+        found=PLACE,
+        more={"annots/train.txt": "".join(f"{name}\n" for name in sorted(names.values()))},
+    )
+
+
+def losses(scene: Scene) -> list[str]:
+    """List the content of a scene that this format, or the loader that it is for, cannot hold."""
+    names = _written_names(scene)
+    old = {new: name for name, new in names.items()}
+    tests = {old[name] for name in sorted(old)[::TEST_EVERY]}
+    lost = colmap_layout.lost_names(names)
+    if not _dated(scene):
+        lost.append("periods that are not in different years: they become the years 1, 2, ...")
+    lost += colmap_layout.lost_masks(scene)
+    return lost + colmap_layout.lost_split(scene, tests, f"every {TEST_EVERY}th image of all")
+
+
+def _written_names(scene: Scene) -> dict[str, str]:
+    """Return the name of each image; names that begin with a day of their period already stay."""
+    dated = _dated(scene)
+    starts = [p.date or "" if dated else f"{p.id + 1:04d}" for p in scene.periods]
+    heads = [(starts[f.period], f.name.partition("_")[0]) for f in scene.frames]
+    if all(_DAY.fullmatch(head) and head.startswith(start) for start, head in heads):
+        return {f.name: f.name for f in scene.frames}
+    days = [start + "-01" * (2 - start.count("-")) for start in starts]
+    return {f.name: f"{days[f.period]}_" + f.name.replace("/", "_") for f in scene.frames}
+
+
+def _dated(scene: Scene) -> bool:
+    """Return True if the periods are in different years, one after the other."""
+    years = [(period.date or "")[:4] for period in scene.periods]
+    return all(years) and all(a < b for a, b in pairwise(years))
 
 
 def remarks(path: Path) -> list[str]:
@@ -140,7 +209,7 @@ def _date(path: Path, name: str) -> date | None:
     prefix = PurePosixPath(name).name.split("_")[0]
     if prefix.lower() == "none":
         return None
-    match = re.fullmatch("([0-9]{4})-([0-9]{1,2})-([0-9]{1,2})", prefix)
+    match = _DAY.fullmatch(prefix)
     try:
         if match is not None:
             return date(*map(int, match.groups()))

@@ -1,10 +1,13 @@
 """NeuSC / 5Pointz: dates, lists, grouping, and pickles that stay closed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import neusc, read_scene
+from chronoscene.scene import Period
 
 NAMES = [
     "2009-08-31_a.png",
@@ -121,3 +124,29 @@ def test_other_undistorted_models_are_not_of_this_format(pointz):
     assert not neusc.matches(folder)
     (folder / "dense/images/a.png").rename(folder / "dense/images/none_a.png")
     assert neusc.matches(folder)
+
+
+def test_written_scenes_keep_what_the_years_say(make_scene_folder, tmp_path):
+    scene = read_scene(make_scene_folder({"a.png": 0, "x/b.png": 0, "c.png": 1, "d.png": 1}))
+    table = (Period(0, "spring", "2016-04"), Period(1, "autumn", "2018-10-03"))
+    out = neusc.write(replace(scene, periods=table), tmp_path / "out")
+    names = ["2016-04-01_a.png", "2016-04-01_x_b.png", "2018-10-03_c.png", "2018-10-03_d.png"]
+    assert (out / "annots/train.txt").read_text().split() == names
+    again = read_scene(out)
+    assert (again.format, again.periods) == ("neusc", table)
+    assert [frame.name for frame in again.frames] == names
+    assert [frame.name for frame in again.select(split="test")] == names[:1]
+    assert [p.label for p in read_scene(out, period_by="month").periods] == ["2016-04", "2018-10"]
+    second = neusc.write(again, tmp_path / "second")
+    assert [frame.name for frame in read_scene(second).frames] == names
+
+
+@pytest.mark.parametrize("dates", [(None, None), ("2016-04", "2016-09"), ("2018", "2016")])
+def test_periods_without_years_of_their_own_are_numbered(make_scene_folder, tmp_path, dates):
+    scene = read_scene(make_scene_folder())
+    table = tuple(Period(i, label, dates[i]) for i, label in enumerate("ab"))
+    scene = replace(scene, periods=table)
+    assert any("they become the years 1, 2" in lost for lost in neusc.losses(scene))
+    again = read_scene(neusc.write(scene, tmp_path / "out"))
+    assert {frame.name[:11] for frame in again.frames} == {"0001-01-01_", "0002-01-01_"}
+    assert again.periods == table

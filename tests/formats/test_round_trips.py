@@ -72,7 +72,7 @@ def scenes(draw):
     return frames, points, table, world
 
 
-LIMITED = ("cl-splats", "wat")
+LIMITED = ("cl-splats", "neusc", "wat")
 """Formats for a certain loader, which hold neither any camera nor any split."""
 
 

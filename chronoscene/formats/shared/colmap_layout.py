@@ -23,7 +23,8 @@ from chronoscene.formats.shared.grouping import Grouped, natural_key
 from chronoscene.images.masks import find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
-from chronoscene.scene import Period, Scene
+from chronoscene.scene import Camera, Period, Scene
+from chronoscene.scene.cameras import as_pinhole
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 
@@ -165,11 +166,20 @@ def write_renamed(
     texts: Collection[str],
     image_source: ImageSource,
     progress: Progress | None,
+    found: FoundModel = (our_format.MODEL, "images"),
+    more: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write ``images/`` and ``sparse/0`` with other image names; complete or not at all.
+    """Write images and a model with other image names; complete or not at all.
 
-    ``names`` maps old to new names of images; of `our_format.TEXTS`, those in ``texts`` are
-    written. The rest is as for `chronoscene.formats.chronoscene`.
+    Args:
+        scene: What to write.
+        out: Folder that does not exist yet, or is empty.
+        names: Old to new names of images.
+        texts: Those of `our_format.TEXTS` to write.
+        image_source: As for `chronoscene.formats.chronoscene`, like ``progress``.
+        progress: Called after each image.
+        found: Folders of the model and of the images.
+        more: Content of further text files by their place.
 
     Raises:
         SceneError: If ``out`` is in use, an image is missing, or two new names are equal.
@@ -187,12 +197,33 @@ def write_renamed(
     for frame in new.frames:
         our_format.check_writable_name(out, frame)
     with staged_folder(out) as staged:
-        our_format.write_texts(new, staged, texts)
-        (staged / "images").mkdir()
+        our_format.write_texts(new, staged, texts, model=found[0])
+        for place, text in (more or {}).items():
+            (staged / place).parent.mkdir(exist_ok=True)
+            (staged / place).write_text(text, encoding="utf-8", newline="\n")
+        (staged / found[1]).mkdir()
         place_images(
-            scene, staged / "images", names=names, image_source=image_source, progress=progress
+            scene, staged / found[1], names=names, image_source=image_source, progress=progress
         )
     return out
+
+
+def readable_camera(camera: Camera, models: Collection[str], loader: str) -> Camera:
+    """Return the same camera in a model that a loader reads, one of some without distortion.
+
+    Raises:
+        SceneError: If the camera has distortion.
+    """
+    if camera.model in models:
+        return camera
+    if camera.is_pinhole:
+        return as_pinhole(camera)
+    raise SceneError(
+        f"camera {camera.camera_id}",
+        expected=f"a camera that {loader} reads: {', '.join(models)}",
+        found=camera.model,
+        todo="run chronoscene undistort first",
+    )
 
 
 def _renamed(scene: Scene, names: Mapping[str, str]) -> Scene:
