@@ -35,6 +35,17 @@ class FourDGaussiansConfig(ProgramConfig):
     """File below `source` with all other options: the one that its page names for own scenes."""
 
 
+@dataclass(frozen=True, slots=True)
+class CLNeRFConfig(ProgramConfig):
+    """Options of the official CLNeRF."""
+
+    iterations: int = 20_000
+    """Steps of each period, a multiple of the 1,000 of an epoch."""
+    scale: float = 8.0
+    """Half the edge of the cube that is modelled; the 99.9th percentile of the depths of points is
+    8. Its scripts have 8 indoors, and 16 or 32 outdoors."""
+
+
 SPLATFACTO = MethodSpec(
     name="nerfstudio-splatfacto",
     title="Splatfacto (nerfstudio)",
@@ -135,6 +146,29 @@ FOUR_D_GAUSSIANS = MethodSpec(
         model="model/point_cloud/iteration_{iterations}/*",
         primitives="model/point_cloud/iteration_{iterations}/point_cloud.ply",
         unit="Gaussians",
+        version=_words("git -C {source} rev-parse HEAD"),
+        tested=_TESTED,
+    ),
+)
+
+CLNERF = MethodSpec(
+    name="clnerf-official",
+    title="CLNeRF (official)",
+    paper="Cai and Müller, CLNeRF: Continual Learning Meets NeRF, ICCV 2023",
+    licence="Apache-2.0; its page says: for non-commercial use",
+    period_input="label",
+    outputs=("rgb",),
+    devices=("cuda",),
+    method="",
+    config="baselines.external:CLNeRFConfig",
+    presets={"balanced": {}},
+    runner=Runner(
+        exports="wat",
+        prepare="baselines.external.prepare:clnerf",
+        train=_words("sh {output}/train.sh"),
+        render=(),
+        images="results/NGPGv2/CLNerf/colmap_ngpa_CLNerf/run/{index:03d}.png",
+        model="model.ckpt",
         version=_words("git -C {source} rev-parse HEAD"),
         tested=_TESTED,
     ),

@@ -7,6 +7,8 @@ the program does with the scene that the user must know.
 from __future__ import annotations
 
 import json
+import shlex
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
-from baselines.external import FourDGaussiansConfig
+from baselines.external import CLNeRFConfig, FourDGaussiansConfig
 from chronoscene.errors import ProgramError
 from chronoscene.formats import read_scene
 from chronoscene.methods import ProgramConfig
@@ -24,6 +26,8 @@ from chronoscene.scene.geometry import camera_centre
 OFF_CENTRE = 0.5  # Pixels of the principal point from the centre that are reported
 
 SAME_FOCAL = 1e-3  # Relative difference of focal lengths that is reported
+
+EPOCH = 1000  # Steps of an epoch of CLNeRF
 
 PUBLISHED_ITERATIONS = "40_000"
 """Iterations, and the ends of schedules, as the config file of ChronoGS writes them."""
@@ -111,6 +115,46 @@ def four_d_gaussians(data: Path, output: Path, config: FourDGaussiansConfig) -> 
     worst = max(ratios, key=abs)
     one = f"has one focal length per image, here {worst:+.1%} off in y"
     return [*_ignored(scene), *([one] if abs(worst) > SAME_FOCAL else [])]
+
+
+def clnerf(data: Path, output: Path, config: CLNeRFConfig) -> list[str]:
+    """A script that trains one period after the other, as those of the program do.
+
+    The last period ends with images of the test views. Each one writes its weights under the same
+    name, and the last are kept.
+    """
+    if config.iterations % EPOCH:
+        raise ProgramError(
+            "iterations",
+            expected=f"a multiple of {EPOCH}, the steps of an epoch",
+            found=str(config.iterations),
+            todo="choose another number with --iterations",
+        )
+    script = Path(config.source, "train_ngpgv2_CLNerf.py").absolute()
+    _read(script)
+    periods, epochs = read_scene(data, format="wat").num_periods, config.iterations // EPOCH
+    options = {
+        "root_dir": data,
+        "dataset_name": "colmap_ngpa_CLNerf",
+        "exp_name": "run",
+        "num_epochs": epochs,
+        "batch_size": 8192,
+        "lr": 1e-2,
+        "rep_size": 10,
+        "task_number": periods,
+        "dim_a": 48,
+        "scale": config.scale,
+        "downsample": 1.0,
+        "vocab_size": periods,
+    }
+    words = ["python", script, *chain(*((f"--{key}", value) for key, value in options.items()))]
+    command = f"{shlex.join(map(str, words))} --task_curr $task"
+    weights = f"ckpts/NGPGv2_CL/colmap_ngpa_CLNerf/run/epoch={epochs - 1}.ckpt"
+    lines = ["set -e", f"for task in {' '.join(map(str, range(periods)))}; do"]
+    lines += [f"  {command}", f"  mv {weights} model.ckpt", "done"]
+    (output / "train.sh").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    each = f"trains {config.iterations} iterations for each of {periods} periods"
+    return [f"{each}, one after the other", "has the images of test views in its training time"]
 
 
 def _nerfies_camera(frame: Frame) -> dict[str, Any]:

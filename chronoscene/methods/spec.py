@@ -34,7 +34,7 @@ class Runner:
     train: tuple[str, ...]
     """The command that trains. Its time is the training time."""
     render: tuple[tuple[str, ...], ...]
-    """Commands that follow it, and end with an image of each test view."""
+    """Commands that follow it, and end with an image of each test view; none if training does."""
     images: str
     """Place of these images below ``{output}``, with ``{name}``, the file name of the view in the
     training set without its extension, or ``{index}``, its number among the test views by name."""

@@ -50,8 +50,8 @@ def installed(tmp_path):
     (source / "arguments/hypernerf/default.py").write_text("ModelHiddenParams = dict()\n")
 
     def options(kind):
-        for script in ("train", "render"):
-            code = f"import runpy, sys\nsys.argv.insert(1, '{kind}_{script}')\n"
+        for script in ("train", "render", "train_ngpgv2_CLNerf"):
+            code = f"import runpy, sys\nsys.argv.insert(1, '{kind}_{script.partition('_')[0]}')\n"
             code += f"runpy.run_path({str(STAND_INS)!r}, run_name='__main__')\n"
             (source / f"{script}.py").write_text(code)
         return {"prefix": f"env PATH={programs}:/usr/bin:/bin", "source": str(source)}
@@ -84,6 +84,39 @@ def test_a_recipe_leads_from_a_scene_to_a_row(
     assert record.strategy == ("pooled" if name == "SPLATFACTO" else "joint")
     told = "4DGaussians (official) has one focal length per image, here +5.0% off in y"
     assert (told in record.notices) == (name == "FOUR_D_GAUSSIANS")
+
+
+def test_clnerf_trains_one_period_after_the_other(bench_here, installed, scene_folder, tmp_path):
+    scene = read_scene(load_format("wat").write(read_scene(scene_folder), tmp_path / "breville"))
+    overrides = installed("clnerf")
+    outcome, _ = bench_here(
+        "baselines.external:CLNERF", scenes=(scene.root,), overrides=overrides, iterations=2000
+    )
+    assert outcome.failures == ()
+    record = read_run(outcome.finished[0])
+    photos = {f.name: load_rgb(scene.image_path(f)) for f in scene.frames}
+    first = {f.period: f.name for f in reversed(scene.frames) if f.split == "train"}
+    expected = [psnr(photos[first[f.period]], photos[f.name]) for f in scene.select(split="test")]
+    assert record.aggregates["micro"]["psnr"] == pytest.approx(np.mean(expected))
+    assert (record.iterations, record.primitives) == (2000, None)
+    assert record.checkpoint_bytes == len("task 1")
+    told = "CLNeRF (official) trains 2000 iterations for each of 2 periods, one after the other"
+    assert told in record.notices
+
+
+def test_test_views_that_a_program_does_not_take_are_refused(bench_here, installed):
+    outcome, _ = bench_here("baselines.external:CLNERF", overrides=installed("clnerf"))
+    (failure,) = outcome.failures
+    assert (
+        "in the format wat: expected what programs take that read it: every 8th" in failure.reason
+    )
+    assert "chronoscene split SCENE --scene-out NEW" in failure.reason
+
+
+def test_parts_of_an_epoch_are_refused(prepared, installed):
+    source = installed("clnerf")["source"]
+    with pytest.raises(ProgramError, match=r"expected a multiple of 1000, .* found 1500"):
+        prepared("CLNERF", prepare.clnerf, "wat", source, iterations=1500)
 
 
 def test_programs_without_a_seed_say_so(bench_here, installed):
@@ -139,9 +172,10 @@ def test_the_recipe_of_the_page_runs(bench_here, tmp_path, monkeypatch):
 def prepared(make_scene, tmp_path):
     """Call a preparation on the scene with other cameras."""
 
-    def run(name, function, format, source, frames=None, **camera):
+    def run(name, function, format, source, frames=None, iterations=None, **camera):
         spec = SPECS[name]
-        config = build_config(spec, preset="balanced", overrides={"source": str(source)})
+        overrides = {"source": str(source)} | ({"iterations": iterations} if iterations else {})
+        config = build_config(spec, preset="balanced", overrides=overrides)
         scene = make_scene()
         frames = [
             replace(f, camera=replace(f.camera, camera_id=i + 1, **camera) if i else f.camera)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import ImageError, ProgramError
-from chronoscene.formats import load_format
+from chronoscene.formats import load_format, read_scene
 from chronoscene.formats.shared.ply import count_vertices
 from chronoscene.harness.files import records
 from chronoscene.harness.files.predictions import ImageWriter, encode_png
@@ -160,17 +160,20 @@ def _run_part(
 
 
 def export_part(scene: Scene, part: Part, out: Path, format: str) -> dict[str, str]:
-    """Write the training set of a model as a scene; return the new name of each view.
+    """Write the training set of a model as a scene; return the name of each view in it.
 
-    Images have the size of the evaluation, and plain names in the order of the old ones: programs
-    cut names at dots, or drop folders. Test views have black photos, as commands that render them
-    want files; no point has an observation in them.
+    Images have the size of the evaluation, and plain names in the order of the old ones, to which
+    some formats add periods: programs cut names at dots, or drop folders. Test views have black
+    photos, as commands that render them want files; no point has an observation in them.
 
     Args:
         scene: The scene, with its points.
         part: Training and test views of the model.
         out: New folder.
         format: Name of the format to write.
+
+    Raises:
+        ProgramError: If programs that read the format choose other test views.
     """
     trained = {view.name for view in part.train.views}
     kept = [f for f in scene.frames if f.name in trained or f in part.test]
@@ -203,7 +206,17 @@ def export_part(scene: Scene, part: Part, out: Path, format: str) -> dict[str, s
     )
     load_format(format).write(exported, out, image_source="link")
     shutil.rmtree(photos)
-    return names
+    written = read_scene(out, format=format)
+    numbered = {Path(f.name).stem.rpartition("_")[2]: f for f in written.frames}
+    views = {old: numbered[Path(name).stem] for old, name in names.items()}
+    if other := [old for old, view in views.items() if (view.split == "test") == (old in trained)]:
+        raise ProgramError(
+            f"test views of a training set in the format {format}",
+            expected=f"what programs take that read it: {written.split_rule}",
+            found=f"others, as {shown(other)}",
+            todo="choose the test views so: chronoscene split SCENE --scene-out NEW",
+        )
+    return {old: view.name for old, view in views.items()}
 
 
 def _write_photos(
@@ -240,7 +253,7 @@ def _find_images(
 ) -> dict[str, Path]:
     """Return the image of each test view in the output of the program."""
     found = {}
-    for index, frame in enumerate(tests):
+    for index, frame in enumerate(sorted(tests, key=lambda frame: names[frame.name])):
         name = Path(names[frame.name]).stem
         found[frame.name] = output / runner.images.format(**values, name=name, index=index)
     if missing := [path for path in found.values() if not path.is_file()]:

@@ -134,5 +134,35 @@ def four_d_render(words):
         show(photo, os.path.join(given["model_path"], place))
 
 
+def clnerf_train(words):
+    given = options(
+        words,
+        *("--root_dir", "--dataset_name", "--exp_name", "--num_epochs", "--batch_size", "--lr"),
+        *("--rep_size", "--task_curr", "--task_number", "--dim_a", "--scale", "--downsample"),
+        "--vocab_size",
+    )
+    images = os.path.join(given["root_dir"], "images")
+    assert os.path.isfile(os.path.join(given["root_dir"], "sparse/0/cameras.bin"))
+    tasks = sorted(os.listdir(images))
+    last, task = len(tasks) - 1, int(given["task_curr"])
+    assert given["task_number"] == given["vocab_size"] == str(len(tasks))
+    run = f"{given['dataset_name']}/{given['exp_name']}"
+    results = f"results/NGPGv2/CLNerf/{run}"
+    assert os.path.isfile(f"{results}/rep/rep_buf.torchSave") == (task > 0)
+    os.makedirs(f"{results}/rep", exist_ok=True)
+    open(f"{results}/rep/rep_buf.torchSave", "w").close()
+    weights = f"ckpts/NGPGv2_CL/{run}/epoch={int(given['num_epochs']) - 1}.ckpt"
+    os.makedirs(os.path.dirname(weights), exist_ok=True)
+    with open(weights, "x") as file:
+        file.write(f"task {task}")
+    index = 0
+    for name in tasks if task == last else ():
+        names = sorted(os.listdir(os.path.join(images, name)))
+        for _ in names[::8]:
+            like = next(n for i, n in enumerate(names) if i % 8)
+            show(os.path.join(images, name, like), f"{results}/{index:03d}.png")
+            index += 1
+
+
 if __name__ == "__main__":
     globals()[sys.argv[1]](sys.argv[2:])
