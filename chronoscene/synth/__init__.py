@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 __all__ = ["PRESETS", "SynthSettings", "generate", "preset"]
 
 
-def generate(out: Path | str, settings: SynthSettings, progress: Progress | None = None) -> None:
+def generate(
+    out: Path | str,
+    settings: SynthSettings,
+    progress: Progress | None = None,
+    *,
+    truth: bool = True,
+) -> None:
     """Generate a scene folder with images, COLMAP model, split and ground truth.
 
     The same settings give the same bytes, whatever the number of threads.
@@ -25,10 +31,12 @@ def generate(out: Path | str, settings: SynthSettings, progress: Progress | None
         out: Folder to create; must not exist or must be empty.
         settings: What to generate; see `preset`.
         progress: Called as ``progress(done, total, what)`` after each unit of work.
+        truth: False for no ground truth, which takes half as long as all photos where there are
+            many periods.
 
     Raises:
         ChronoSceneError: If ``out`` already contains files.
     """
     from chronoscene.synth.generation import run
 
-    run(Path(out), settings, progress)
+    run(Path(out), settings, progress, truth=truth)

@@ -26,19 +26,24 @@ MONTHS = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
 FIRST_YEAR = 2016
 
 
-def run(out: Path, settings: SynthSettings, progress: Progress | None = None) -> None:
+def run(
+    out: Path, settings: SynthSettings, progress: Progress | None = None, *, truth: bool = True
+) -> None:
     """Generate a scene; see `chronoscene.synth.generate`. Either all of it appears or nothing."""
     progress = progress or (lambda done, total, what: None)
     progress(0, 1, "city")
     with staged_folder(out) as staged:
         raw = staged.parent / "raw"
-        scene = _make(raw, settings, progress, out.name)
+        scene = _make(raw, settings, progress, out.name, truth=truth)
         scene_format.write(scene, staged, image_source="link")
-        (raw / "gt").rename(staged / "gt")
+        if truth:
+            (raw / "gt").rename(staged / "gt")
 
 
-def _make(raw: Path, settings: SynthSettings, progress: Progress, name: str) -> Scene:
-    """Write photos and ground truth below ``raw`` and return the scene."""
+def _make(
+    raw: Path, settings: SynthSettings, progress: Progress, name: str, *, truth: bool
+) -> Scene:
+    """Write photos and, if wanted, ground truth below ``raw`` and return the scene."""
     world = make_world(settings)
     renderers = make_renderers(settings, world)
     scene = Scene(
@@ -52,7 +57,7 @@ def _make(raw: Path, settings: SynthSettings, progress: Progress, name: str) -> 
         format=scene_format.NAME,
         world=WorldFrame(unit="metre"),
     )
-    tests = len(scene.select(split="test"))
+    tests = len(scene.select(split="test")) if truth else 0
     total = len(scene.frames) + tests * (settings.periods - 1) + 2
     done = 0
 
@@ -69,8 +74,9 @@ def _make(raw: Path, settings: SynthSettings, progress: Progress, name: str) -> 
     progress(done, total, "points")
     points = make_points(settings, scene, renderers)
     advance("points")
-    progress(done, total, "ground truth")
-    write_truth(raw / "gt", scene, world, renderers, advance)
+    if truth:
+        progress(done, total, "ground truth")
+        write_truth(raw / "gt", scene, world, renderers, advance)
     return replace(scene, points=points)
 
 

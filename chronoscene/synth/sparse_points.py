@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ MAX_TRACK_LENGTH = 14
 CANDIDATES_PER_POINT = 1.7  # Candidates per requested point; many are seen by too few frames
 MAX_ALBEDO_CHANGE = 0.003  # Maximum albedo difference between periods that share a point
 MAX_DEPTH = 450.0  # Metres; more distant points are not useful
+ROWS = 4096  # Points whose tracks are chosen at a time: a number for each frame of each is drawn
 
 
 class Candidates(NamedTuple):
@@ -38,6 +40,20 @@ class Candidates(NamedTuple):
     """Object. [N]"""
     albedo: Array
     """Full detail. [N, 3]"""
+
+
+class Sightings(NamedTuple):
+    """Points that a frame sees (M points)."""
+
+    rows: NDArray[np.int64]
+    """Their rows among all, ascending. [M]"""
+    xy: Array
+    """Their pixels. [M, 2]"""
+
+    def select(self, keep: NDArray[np.int64]) -> Sightings:
+        """Return those of some points, by their rows among these; ``keep`` is ascending."""
+        kept = np.isin(self.rows, keep, assume_unique=True)
+        return Sightings(np.searchsorted(keep, self.rows[kept]), self.xy[kept])
 
 
 def make_points(
@@ -55,18 +71,26 @@ def make_points(
     rng = rng_for(settings.seed, "points")
     train = [i for i, f in enumerate(scene.frames) if f.split == "train"]
     frames = [scene.frames[i] for i in train]
-    images = [load_rgb(scene.image_path(f)) for f in frames]
+    # Photos are decoded twice: hundreds of large ones would not fit into memory together.
+    photos = [scene.image_path(f) for f in frames]
     count = int(np.ceil(CANDIDATES_PER_POINT * settings.points / len(frames)))
     found = [
-        _candidates(renderers[frame.period], frame, image, count, rng)
-        for frame, image in zip(frames, images, strict=True)
+        _candidates(renderers[frame.period], frame, load_rgb(photo), count, rng)
+        for frame, photo in zip(frames, photos, strict=True)
     ]
     candidates = Candidates(*map(np.concatenate, zip(*found, strict=True)))
-    seen, xy = _visibility(candidates, frames, renderers)
-    keep = np.flatnonzero(seen.sum(axis=1) >= MIN_TRACK_LENGTH)
+    views = _visibility(candidates, frames, renderers)
+    numbers = np.zeros(len(candidates.xyz), np.int64)
+    for view in views:
+        numbers[view.rows] += 1
+    keep = np.flatnonzero(numbers >= MIN_TRACK_LENGTH)
     if len(keep) > settings.points:
         keep = np.sort(rng.choice(keep, settings.points, replace=False))
-    points = _assemble(candidates.xyz[keep], seen[keep], xy[keep], images, settings.noise, rng)
+    if len(keep) == 0:
+        return Points.empty()
+    views = [view.select(keep) for view in views]
+    size = frames[0].camera.size
+    points = _assemble(candidates.xyz[keep], views, photos, size, settings.noise, rng)
     return replace(points, track_frame=np.array(train, np.int32)[points.track_frame])
 
 
@@ -104,19 +128,17 @@ def _rays(origin: NDArray[np.floating], directions: NDArray[np.floating]) -> NDA
 
 def _visibility(
     candidates: Candidates, frames: Sequence[Frame], renderers: Sequence[PeriodRenderer]
-) -> tuple[NDArray[np.bool_], Array]:
-    """Mask of the frames that see each point, and its pixels there. [N, F], [N, F, 2]"""
-    seen = np.zeros((len(candidates.xyz), len(frames)), bool)
-    xy = np.zeros((len(candidates.xyz), len(frames), 2))
+) -> list[Sightings]:
+    """Find the points that each frame sees."""
+    found = []
     same = _unchanged(candidates, renderers)
-    for column, frame in enumerate(frames):
+    for frame in frames:
         camera, k = frame.camera, frame.camera.K
         local = candidates.xyz @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             at = local[:, :2] / local[:, 2:] * [k[0, 0], k[1, 1]] + k[:2, 2]
         inside = (local[:, 2] > 0.1) & np.all((at >= 0) & (at < [camera.width, camera.height]), 1)
         rows = np.flatnonzero(inside & same[:, frame.period])
-        xy[rows, column] = at[rows]
         # A point is seen if the ray to it ends there, on the same object.
         renderer, depth = renderers[frame.period], local[rows, 2]
         centre = np.linalg.inv(frame.cam_from_world)[:3, 3]
@@ -124,8 +146,9 @@ def _visibility(
             _rays(centre, (candidates.xyz[rows] - centre) / depth[:, None])
         )
         close = np.abs(hits.t - depth) < 1e-4 * depth + 1e-3
-        seen[rows, column] = close & (renderer.elements_of(hits.tri) == candidates.element[rows])
-    return seen, xy
+        seen = close & (renderer.elements_of(hits.tri) == candidates.element[rows])
+        found.append(Sightings(rows[seen], at[rows[seen]]))
+    return found
 
 
 def _unchanged(candidates: Candidates, renderers: Sequence[PeriodRenderer]) -> NDArray[np.bool_]:
@@ -142,9 +165,9 @@ def _unchanged(candidates: Candidates, renderers: Sequence[PeriodRenderer]) -> N
 
 def _assemble(
     xyz: Array,
-    seen: NDArray[np.bool_],
-    xy: Array,
-    images: Sequence[NDArray[np.uint8]],
+    views: Sequence[Sightings],
+    photos: Sequence[Path],
+    size: tuple[int, int],
     noise: float,
     rng: np.random.Generator,
 ) -> Points:
@@ -152,31 +175,22 @@ def _assemble(
 
     Args:
         xyz: Points that enough frames see. [N, 3]
-        seen: Which frames see them. [N, F]
-        xy: Where they do. [N, F, 2]
-        images: Images of the F training frames. [H, W, 3] each
+        views: Those that each of the F training frames sees.
+        photos: Their images.
+        size: Width and height of these.
         noise: Standard deviation of the noise on observations, in pixels.
         rng: Draws the subsets and the noise.
     """
-    wanted = np.minimum(MIN_TRACK_LENGTH + rng.geometric(0.28, len(xyz)) - 1, MAX_TRACK_LENGTH)
-    # Random keys, unseen last: the first entries of the sorted row are a random subset.
-    keys = np.where(seen, rng.random(seen.shape), 2.0)
-    order = np.argsort(keys, axis=1)
-    length = np.minimum(seen.sum(axis=1), wanted)
-    rows = np.repeat(np.arange(len(xyz)), length)
+    rows, columns, length = _choose(len(xyz), views, rng)
     start = np.concatenate([[0], np.cumsum(length)])
-    columns = order[rows, np.arange(len(rows)) - start[rows]]
-    by_view = np.lexsort((columns, rows))
-    rows, columns = rows[by_view], columns[by_view]
-    where = xy[rows, columns]
-    color = np.zeros((len(rows), 3))
-    for column, image in enumerate(images):
-        mine = columns == column
+    where, color = np.zeros((len(rows), 2)), np.zeros((len(rows), 3))
+    for column, (view, photo) in enumerate(zip(views, photos, strict=True)):
+        mine = np.flatnonzero(columns == column)
+        where[mine] = view.xy[np.searchsorted(view.rows, rows[mine])]
         cell = np.floor(where[mine]).astype(int)
-        color[mine] = image[cell[:, 1], cell[:, 0]]
+        color[mine] = load_rgb(photo)[cell[:, 1], cell[:, 0]]
     shift = rng.normal(0, noise, where.shape) if noise > 0 else np.zeros_like(where)
-    high, width = images[0].shape[:2]
-    shift = np.clip(where + shift, 0, np.array([width, high]) - 1e-6) - where
+    shift = np.clip(where + shift, 0, np.array(size) - 1e-6) - where
     error = np.add.reduceat(np.hypot(*shift.T), start[:-1]) / length
     mean = np.add.reduceat(color, start[:-1]) / length[:, None]
     return Points(
@@ -188,3 +202,33 @@ def _assemble(
         track_frame=columns.astype(np.int32),
         track_xy=where + shift,
     )
+
+
+def _choose(
+    count: int, views: Sequence[Sightings], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Choose observations of points; return point and frame of each, and how many each point has.
+
+    They are sorted by point and frame.
+    """
+    wanted = np.minimum(MIN_TRACK_LENGTH + rng.geometric(0.28, count) - 1, MAX_TRACK_LENGTH)
+    seers = np.repeat(np.arange(len(views)), [len(view.rows) for view in views])
+    seen_rows = np.concatenate([view.rows for view in views])
+    order = np.argsort(seen_rows, kind="stable")
+    seen_rows, seers = seen_rows[order], seers[order]
+    parts = []
+    for first in range(0, count, ROWS):
+        last = min(first + ROWS, count)
+        a, b = np.searchsorted(seen_rows, [first, last])
+        row, column = seen_rows[a:b], seers[a:b]
+        # The observations of a point with the smallest of random keys are a random subset.
+        keys = rng.random((last - first, len(views)))[row - first, column]
+        sorted_ = np.lexsort((keys, row))
+        row, column = row[sorted_], column[sorted_]
+        rank = np.arange(len(row)) - np.searchsorted(row, row)
+        chosen = rank < wanted[row]
+        parts.append((row[chosen], column[chosen]))
+    rows, columns = (np.concatenate(x) for x in zip(*parts, strict=True))
+    by_view = np.lexsort((columns, rows))
+    rows, columns = rows[by_view], columns[by_view]
+    return rows, columns, np.bincount(rows, minlength=count)
