@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from baselines.cl_splats.changes import Mask, change_mask, change_scores
+from baselines.cl_splats.changes import Mask, changed_pixels
 from baselines.cl_splats.config import CLSplatsConfig
 from baselines.cl_splats.model import PeriodModel
 from chronoscene.gaussians.model import initialise
@@ -98,7 +98,7 @@ def compare(
     view, photo, mask = train.views[index], train.load_image(index), train.load_mask(index)
     prediction = render(view, period)
     assert prediction.depth is not None
-    changed = change_mask(change_scores(prediction.rgb, photo, mask), config)
+    changed = changed_pixels(prediction.rgb, photo, mask, config)
     counts = np.ones_like(changed) if mask is None else mask
     depth = np.where(prediction.depth > 0, prediction.depth, np.inf)
     return Comparison(view, photo, counts, changed & counts, depth)

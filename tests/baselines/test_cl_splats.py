@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from toy_scene import ring_of_views, toy_scene
 
 from baselines.cl_splats import SPEC
-from baselines.cl_splats.changes import change_mask, change_scores
+from baselines.cl_splats.changes import change_mask, change_scores, changed_pixels
 from baselines.cl_splats.config import CLSplatsConfig
 from baselines.cl_splats.lifting import Comparison, enclose, new_points, vote
 from baselines.cl_splats.method import CLSplats
@@ -150,6 +150,24 @@ def test_masks_have_no_small_spots_and_no_small_holes() -> None:
     mask = change_mask(scores, config(dilation=0.0))
     assert not mask[280:].any() and mask[176:178, 176:178].all()
     assert (mask & clean).sum() > 0.95 * clean.sum() and not mask[~clean].any()
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_wide_photos_are_compared_small(ignored: bool) -> None:
+    """Each pixel of the small images becomes 5 x 5: the mask is theirs, and follows the edges."""
+    image, options = picture(), config()
+    photo = as_photo(image)
+    photo[40:70, 60:100] = as_photo(image[40:70, 60:100, ::-1] * [0.3, 1.0, 1.2])
+    counts = np.ones(photo.shape[:2], bool)
+    counts[:, :20] = not ignored
+    wide = [np.kron(x, np.ones((5, 5, 1))) for x in (image, photo)]
+    mask = changed_pixels(
+        wide[0], wide[1].astype(np.uint8), np.kron(counts, np.ones((5, 5))) > 0, options
+    )
+    assert mask.shape == (600, 800)
+    own = change_mask(change_scores(image, photo, counts), options)
+    assert (mask == np.kron(own, np.ones((5, 5)))).mean() > 0.99
+    assert mask[205:345, 305:495].all()
 
 
 # Lifting
