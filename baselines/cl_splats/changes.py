@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -51,10 +53,14 @@ def changed_pixels(
     if width <= _WIDTH:
         return change_mask(change_scores(render, photo, counts), config)
     size = _WIDTH, max(round(height * _WIDTH / width), 1)
-    one, other = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (render, photo))
+
+    def average(image: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
     counts = None if counts is None else resize_mask(counts, size)
-    mask = change_mask(change_scores(one, other, counts), config).astype(np.uint8)
-    return np.asarray(cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST), bool)
+    mask = change_mask(change_scores(average(render), average(photo), counts), config)
+    large = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return large.astype(bool)
 
 
 def change_scores(

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,20 +94,23 @@ def measure(case: Case, data: Path) -> Run:
     """Run a case once."""
     with tempfile.TemporaryDirectory() as out:
         arguments = [a.replace("DATA", str(data)).replace("OUT", out) for a in case.arguments]
-        code = "from chronoscene.cli import main; main()"
-        before, start = os.times(), time.perf_counter()
-        process = subprocess.Popen(
-            [sys.executable, "-c", code, *arguments],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-        )
-        watch = MemoryWatch(process.pid)
-        watch.start()
-        _, errors = process.communicate()
-        elapsed, after = time.perf_counter() - start, os.times()
-        watch.done.set()
+        return measure_command(case.name, arguments)
+
+
+def measure_command(name: str, arguments: Sequence[str]) -> Run:
+    """Run a command of ``chronoscene`` once, in a process of its own."""
+    code = "from chronoscene.cli import main; main()"
+    before, start = os.times(), time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    watch = MemoryWatch(process.pid)
+    watch.start()
+    _, errors = process.communicate()
+    elapsed, after = time.perf_counter() - start, os.times()
+    watch.done.set()
     if process.returncode != 0:
-        raise SystemExit(f"{case.name}: status {process.returncode}\n{errors.decode()}")
+        raise SystemExit(f"{name}: status {process.returncode}\n{errors.decode()}")
     cpu = sum(after[2:4]) - sum(before[2:4])
     return Run(elapsed, cpu, watch.largest / 1e9, watch.together / 1e9)
 

@@ -1,0 +1,181 @@
+"""Time, memory and disk of the commands against the number of photos.
+
+    python -m benchmarks.data.growth FOLDER [--photos 100 300 700] [--steps 300] [--methods M ...]
+
+Generates a city at five dates, with photos of 1600x1200 pixels (one ray a pixel, no ground truth)
+and at most 500,000 points; smaller scenes have every n-th photo of it, and the points that two of
+these see. Trains each method for so many steps of preset `balanced`; the first one's run is
+rendered, compressed, exported and shown in a page. Each command runs once, in a process of its own.
+Its figures stay in FOLDER: the next call does only what is missing. Prints seconds of computing
+time, the largest resident memory of all processes together and what lies on the disk, then how
+they grow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from benchmarks.data.dataset_scale import measure_command
+from chronoscene.edit import Edits, edit
+from chronoscene.formats import read_scene
+from chronoscene.harness.files.provenance import code_version, processor_name
+from chronoscene.scene import Frame
+from chronoscene.synth import generate, preset
+
+PERIODS = 5
+SIZE = (1600, 1200)
+POINTS = 500_000
+PRESET = "balanced"
+FRAMES = 24
+"""Pictures of the animation."""
+MEASURES = (
+    ("CPU s", "cpu", 1, 0),
+    ("GB of memory", "together", 1, 2),
+    ("MB on disk", "disk", 1, 1),
+)
+"""Name, key, factor and digits."""
+
+Figures = dict[str, dict[str, float]]
+"""Of each command: elapsed and CPU seconds, gigabytes, and megabytes of what it wrote."""
+
+
+def make_scene(folder: Path, photos: int) -> None:
+    """Generate the largest scene."""
+    settings = preset(
+        "city",
+        periods=PERIODS,
+        width=SIZE[0],
+        height=SIZE[1],
+        views=photos // PERIODS,
+        points=POINTS,
+        supersample=1,
+        seed=11,
+    )
+    generate(folder, settings, truth=False)
+
+
+def thin_out(whole: Path, folder: Path, photos: int) -> None:
+    """Write a scene of so many photos of another, evenly among those of each split."""
+    scene = read_scene(whole)
+    share = photos / len(scene.frames)
+
+    def some(frames: Sequence[Frame]) -> list[str]:
+        chosen = pairwise(math.floor(i * share) for i in range(len(frames) + 1))
+        return [f.name for f, (a, b) in zip(frames, chosen, strict=True) if b > a]
+
+    keep = (*some(scene.select(split="train")), *some(scene.select(split="test")))
+    edit(scene, folder, Edits(keep=keep), image_source="link")
+
+
+def commands(
+    folder: Path, scene: Path, methods: Sequence[str], steps: int
+) -> Iterator[tuple[str, Callable[[], list[str]], Callable[[], Path]]]:
+    """Name, arguments and output of each command, in an order in which they can run."""
+    runs, out = folder / "runs", folder / "out" / scene.name
+
+    def run() -> Path:
+        pattern = f"{scene.name}/{methods[0]}-*{PRESET}*/seed0"
+        return next(path for path in sorted(runs.glob(pattern)) if "compressed" not in str(path))
+
+    def compressed() -> Path:
+        return next(runs.glob(f"{scene.name}/{methods[0]}-*compressed*/seed0/checkpoint"))
+
+    yield "validate", lambda: ["validate", str(scene)], lambda: scene
+    yield "stats", lambda: ["stats", str(scene)], lambda: scene
+    for method in methods:
+        options = ["--method", method, "--preset", PRESET, "--iterations", str(steps)]
+        words = ["bench", str(scene), *options, "--out", str(runs)]
+        pattern = f"{scene.name}/{method}-*{PRESET}*/seed0/checkpoint"
+        yield (
+            f"bench, {method}",
+            lambda words=words: words,  # type: ignore[misc]
+            lambda pattern=pattern: next(runs.glob(pattern)),  # type: ignore[misc]
+        )
+    film = out / "film.mp4"
+    words = ["--cameras", "orbit", "--frames", str(FRAMES), "--out", str(film)]
+    yield "render", lambda: ["render", str(run()), *words], lambda: film
+    yield "compress", lambda: ["compress", str(run())], compressed
+    model = out / "model.ply"
+    place = ["--period", "0", "--out", str(model)]
+    yield "export", lambda: ["export", str(run()), *place], lambda: model
+    page = out / "page"
+    yield "page", lambda: ["page", str(run()), "--out", str(page)], lambda: page
+
+
+def measure(folder: Path, scene: Path, methods: Sequence[str], steps: int) -> Figures:
+    """Run what is missing and return the figures of all commands."""
+    file = folder / f"{scene.name}.json"
+    figures: Figures = json.loads(file.read_text("utf-8")) if file.exists() else {}
+    (folder / "out" / scene.name).mkdir(parents=True, exist_ok=True)
+    for name, arguments, output in commands(folder, scene, methods, steps):
+        if name in figures:
+            continue
+        found = asdict(measure_command(f"{name}, {scene.name}", arguments()))
+        figures[name] = {**found, "disk": size_of(output()) / 1e6}
+        file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        print(scene.name, name, figures[name], flush=True)
+    return figures
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of all in a folder."""
+    return sum(p.stat().st_size for p in (path, *path.rglob("*")) if p.is_file())
+
+
+def table(figures: Mapping[int, Figures]) -> str:
+    """Each measure by command and number of photos, with exponents, as Markdown."""
+    sizes = list(figures)
+    growth = [f"{a} to {b}" for a, b in pairwise(sizes)]
+    lines = []
+    for title, key, factor, digits in MEASURES:
+        heads = [f"{title}: {sizes[0]} photos", *(f"{n}" for n in sizes[1:]), *growth]
+        lines += ["| | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
+        for name in next(iter(figures.values())):
+            values = [factor * figures[n].get(name, {}).get(key, math.nan) for n in sizes]
+            texts = [f"{value:,.{digits}f}" for value in values]
+            powers = [
+                f"{math.log(values[i + 1] / values[i]) / math.log(sizes[i + 1] / sizes[i]):.2f}"
+                for i in range(len(growth))
+            ]
+            lines.append(f"| {name} | " + " | ".join([*texts, *powers]) + " |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def about(scene: Path) -> str:
+    """What is in a scene, in a line."""
+    found = read_scene(scene)
+    tests, points = len(found.select(split="test")), len(found.points)
+    return f"{scene.name}: {len(found.frames)} photos, {tests} of them test views, {points} points"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, help="keeps scenes, runs and figures")
+    parser.add_argument("--photos", type=int, nargs="+", default=[100, 300, 700])
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--methods", nargs="+", default=["chronogs", "scaffold-gs", "3dgs"])
+    options: Any = parser.parse_args()
+    sizes = sorted(options.photos)
+    scenes = {n: options.folder / f"photos-{n}" for n in sizes}
+    if not scenes[sizes[-1]].exists():
+        make_scene(scenes[sizes[-1]], sizes[-1])
+    for n in sizes[:-1]:
+        if not scenes[n].exists():
+            thin_out(scenes[sizes[-1]], scenes[n], n)
+    found = {n: measure(options.folder, scenes[n], options.methods, options.steps) for n in sizes}
+    shutil.rmtree(options.folder / "out", ignore_errors=True)
+    print(f"{processor_name()}, commit {code_version()}, {options.steps} steps")
+    print(*(about(scene) for scene in scenes.values()), "", table(found), sep="\n")
+
+
+if __name__ == "__main__":
+    main()
