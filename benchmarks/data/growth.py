@@ -100,7 +100,7 @@ def commands(
             lambda pattern=pattern: next(runs.glob(pattern)),  # type: ignore[misc]
         )
     film = out / "film.mp4"
-    words = ["--cameras", "orbit", "--frames", str(FRAMES), "--out", str(film)]
+    words = ["--cameras", "orbit", "--period", "0", "--frames", str(FRAMES), "--out", str(film)]
     yield "render", lambda: ["render", str(run()), *words], lambda: film
     yield "compress", lambda: ["compress", str(run())], compressed
     model = out / "model.ply"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 
@@ -72,13 +73,19 @@ def score(
         click.get_current_context().exit(SOME_FAILED)
 
 
-def print_runs(out: Path) -> None:
-    """Print the tables of all runs in a folder, and the files that belong to all of them."""
+def print_runs(out: Path, new: Collection[Path] | None = None) -> None:
+    """Print the tables of all runs in a folder, and the files that belong to all of them.
+
+    Args:
+        out: Folder of runs.
+        new: Folders of runs; figures are drawn of the scenes of these. None for all of them.
+    """
     records, failures = read_runs([out])
     text = format_runs(records, failures, "table", width=terminal_width(None))
     emit(text + "\n", None)
-    drawers = (draw_figures, draw_stages, draw_sharing)
-    figures = [path for draw in drawers for path in draw(out, records)]
+    scenes = {run.scene for run in records if new is None or run.folder in new}
+    drawn = [run for run in records if run.scene in scenes]
+    figures = [*draw_figures(out, drawn), *draw_stages(out, drawn), *draw_sharing(out, records)]
     emit("".join(f"{path}\n" for path in (out / RESULTS_FILE, out / ROWS_FILE, *figures)), None)
 
 

@@ -202,7 +202,7 @@ def settings_from(
 def report(outcome: BenchOutcome, out: Path) -> None:
     """Print what is in the folder of runs, and why runs failed."""
     if outcome.finished:
-        print_runs(out)
+        print_runs(out, outcome.finished)
     else:
         for failure in read_failures(out):
             say(f"failed: {failure.scene}, {failure.method}: {failure.reason}")
