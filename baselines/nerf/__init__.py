@@ -32,7 +32,7 @@ def _presets(flags: dict[str, Any]) -> dict[str, dict[str, Any]]:
 _COMMON: dict[str, Any] = {
     "outputs": ("rgb", "alpha", "depth"),
     "devices": ("cpu", "cuda"),
-    "config": "baselines.nerf.config:NerfConfig",
+    "config": "baselines.nerf.config:PlainConfig",
     "mixes_views": True,
     "draws_gaussians": False,
     "learns_background": True,
@@ -128,5 +128,5 @@ NEUSC = MethodSpec(
     period_input="continuous",
     method="baselines.nerf.method:NeuSC",
     presets=_presets({"time": "steps", "appearance": "image", "transient": "mask"}),
-    **_COMMON,
+    **_COMMON | {"config": "baselines.nerf.config:NeuSCConfig"},
 )

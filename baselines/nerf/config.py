@@ -45,9 +45,33 @@ class NerfConfig(FieldConfig):
 
 
 @dataclass(frozen=True)
+class PlainConfig(NerfConfig):
+    """Options of NeRF and NeRF-W."""
+
+    time: Literal["none", "frequencies"] = "none"
+    """Dependence of colours on the time t = period / (T - 1): not; by sines and cosines of it."""
+    appearance: Literal["none", "image"] = "none"
+    """Code of a photo's light: none, or a learned one for each photo."""
+
+
+@dataclass(frozen=True)
+class NeuSCConfig(NerfConfig):
+    """Options of NeuSC."""
+
+    appearance: Literal["none", "image"] = "none"
+    """Code of a photo's light: none, or a learned one for each photo."""
+    transient: Literal["none", "mask"] = "none"
+    """Treatment of what is only in one photo: none; a mask of the photo that weakens the loss."""
+
+
+@dataclass(frozen=True)
 class HaNerfConfig(NerfConfig):
     """Options of Ha-NeRF."""
 
+    time: Literal["none", "frequencies"] = "none"
+    """Dependence of colours on the time t = period / (T - 1): not; by sines and cosines of it."""
+    appearance: Literal["none", "encoder"] = "none"
+    """Code of a photo's light: none, or what a network makes of the photo."""
     channels: PositiveInt = 16
     """Channels of the first convolution; the others have twice, and then four times as many."""
     photo_size: Annotated[int, Field(ge=16)] = 32

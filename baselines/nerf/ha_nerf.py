@@ -54,6 +54,8 @@ class HaNerf(LitNerf):
 
     def initial(self, train: TrainingSet, generator: torch.Generator) -> dict[str, Tensor]:
         params = super().initial(train, generator)
+        if self.config.appearance == "none":
+            return params
         layers = initial_encoder(self.config.channels, self.config.appearance_size, generator)
         return params | named("encoder", layers)
 
@@ -106,9 +108,10 @@ class HaNerf(LitNerf):
         return self._means
 
     def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:
-        return super().loss(drawn, rays, progress) + (
-            self.config.code_weight * self._codes.square().mean()
-        )
+        loss = super().loss(drawn, rays, progress)
+        if self.config.appearance == "none":
+            return loss
+        return loss + self.config.code_weight * self._codes.square().mean()
 
     def rates(self, progress: float) -> dict[str, float]:
         rates = super().rates(progress)
@@ -121,7 +124,10 @@ class HaNerf(LitNerf):
         return max(_LEAST_MASK_WEIGHT, self.config.mask_weight * math.exp(-_MASK_DECAY * steps))
 
     def stored(self) -> dict[str, Tensor]:
-        return super().stored() | {"period_lights": self.period_lights()}
+        stored = super().stored()
+        if self.config.appearance != "none":
+            stored["period_lights"] = self.period_lights()
+        return stored
 
 
 class HaNerfT(HaNerf):

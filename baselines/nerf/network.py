@@ -20,6 +20,11 @@ def time_size(config: NerfConfig) -> int:
     return sizes[config.time]
 
 
+def light_size(config: NerfConfig) -> int:
+    """Length of the code of a photo's light."""
+    return 0 if config.appearance == "none" else config.appearance_size
+
+
 class NerfNetwork(FieldNetwork):
     """Density of the place alone; colour of features, direction, time and the photo's light."""
 
@@ -28,9 +33,7 @@ class NerfNetwork(FieldNetwork):
     @classmethod
     def begin(cls, config: NerfConfig, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw the tensors of a new field."""
-        light = config.appearance_size if config.appearance != "none" else 0
-        color = time_size(config) + light
-        params = cls.initial(config, 0, color, generator)
+        params = cls.initial(config, 0, time_size(config) + light_size(config), generator)
         if config.transient == "density":
             widths = (config.features + config.transient_size, config.hidden, TRANSIENT_OUTPUTS)
             params |= named("transient", initial_layers(widths, generator), biases=False)
@@ -81,7 +84,7 @@ class ContentNetwork(NerfNetwork):
         params |= named("content", initial_layers(widths, generator), biases=not position)
         widths = (hidden, hidden, 3)
         params |= named("content_rgb", initial_layers(widths, generator), biases=not position)
-        widths = (hidden + 3 + config.appearance_size, hidden, 3)
+        widths = (hidden + 3 + light_size(config), hidden, 3)
         return params | named("light", initial_layers(widths, generator), biases=not position)
 
     def values(
@@ -89,7 +92,7 @@ class ContentNetwork(NerfNetwork):
     ) -> Tensor:
         """Return colours in the light of a photo, and those of the content behind them. [N, 6]"""
         del directions  # as in the released configuration
-        when, light = color.split((time_size(self.config), self.config.appearance_size), dim=1)
+        when, light = color.split((time_size(self.config), light_size(self.config)), dim=1)
         if "table_content" in self.params:
             features = torch.cat((features, self.encode_with("table_content", places)), dim=1)
         content = torch.relu(self.mlp("content", features, when, groups))

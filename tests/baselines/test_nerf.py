@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -26,6 +29,34 @@ def neusc() -> Any:
     for i in range(3):
         method.step(i, i / 3)
     return method
+
+
+FLAGS = ("time", "appearance", "transient")
+"""Options that make the methods of the family, in any combination that their configs allow."""
+
+
+def combinations() -> Iterator[Any]:
+    for name in ("nerf-w-t", "neusc", "ha-nerf-t"):
+        types = get_type_hints(import_object(load_spec(name).config))
+        for values in product(*(get_args(types[flag]) for flag in FLAGS)):
+            yield pytest.param(name, values, id="-".join((name, *values)))
+
+
+@pytest.mark.parametrize(("name", "values"), tuple(combinations()))
+def test_flags_go_together(name: str, values: tuple[str, ...], tmp_path: Path) -> None:
+    spec = load_spec(name)
+    flags = dict(zip(FLAGS, values, strict=True))
+    config = build_config(spec, preset="fast", overrides=SMALL | flags)
+    method: FieldMethod = import_object(spec.method)(config)
+    data = make_training_set(3)
+    method.setup(data, seed=0, device="cpu")
+    for i in range(2):
+        assert method.step(i, i / 2).skipped is None
+    method.save(tmp_path)
+    loaded: FieldMethod = type(method)(config)
+    loaded.load(tmp_path, device="cpu")
+    images = [m.render(data.views[0], 1.0).rgb for m in (method, loaded)]
+    assert np.array_equal(*images)
 
 
 def test_steps_are_hard_and_have_a_slope() -> None:
