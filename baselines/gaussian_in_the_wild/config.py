@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from chronoscene.gaussians.config import GaussianConfig
 
@@ -45,7 +45,7 @@ class GaussianInTheWildConfig(GaussianConfig):
     """Units of the first layer; the others have 3/4, 1/2 and 3/8 as many."""
     frequencies: NonNegativeInt = 10
     """Frequencies of the encoding of positions."""
-    position_unit: NonNegativeFloat = 1.0
+    position_unit: PositiveFloat = 1.0
     """Positions are encoded as multiples of this length, in `length_unit`."""
     start_from_points: bool = False
     """True for a network whose output is added to the constant colour of each Gaussian, at first

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
-from pydantic import NonNegativeFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from chronoscene.gaussians.config import GaussianConfig
 
@@ -22,9 +22,9 @@ class Realtime4DGSConfig(GaussianConfig):
     start_times: Literal["uniform", "seen"] = "uniform"
     """Time centres at the start. ``uniform``: anywhere from 0.1 before the first period to 0.1
     after the last. ``seen``: the mean of the periods whose photos see the sparse point."""
-    initial_time_scale: NonNegativeFloat = 0.2**0.5
+    initial_time_scale: PositiveFloat = 0.2**0.5
     """Standard deviations in time at the start."""
-    wave_cycle: NonNegativeFloat = 1.0
+    wave_cycle: PositiveFloat = 1.0
     """Length of the longest wave of the colours in time. 1: each Gaussian has the same colour in
     the first period and in the last, as in the released code."""
     wave_interval: PositiveInt = 1_000

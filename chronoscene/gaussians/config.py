@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from chronoscene.errors import ConfigError
 from chronoscene.training.config import SplattingConfig
@@ -57,9 +57,9 @@ class GaussianConfig(SplattingConfig):
     `mcmc_growth` in each round until it has `max_gaussians`, which must be given, and all
     positions move at random: `chronoscene.gaussians.mcmc`. Its authors train so with
     ``densify_until=25000``, ``initial_opacity=0.5`` and ``initial_scale=0.1``."""
-    initial_opacity: NonNegativeFloat = 0.1
+    initial_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of each Gaussian at the start."""
-    initial_scale: NonNegativeFloat = 1.0
+    initial_scale: PositiveFloat = 1.0
     """Scale of each Gaussian at the start, times the distance of the points around it."""
     densify_from: NonNegativeInt = 500
     """Moment after which Gaussians are added and pruned."""

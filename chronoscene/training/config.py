@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 
 from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
 from chronoscene.methods import check_options
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.exposure import ExposureKind
@@ -21,7 +22,7 @@ class SplattingConfig:
     """Unit of the options that are lengths. ``world``: that of the scene, as in released code;
     ``training``: that of the training frame, in which the farthest camera is at distance 1, so
     that the unit of the scene does not matter."""
-    near_plane: NonNegativeFloat = NEAR_PLANE
+    near_plane: PositiveFloat = NEAR_PLANE
     """Nearest depth that is drawn, in `length_unit`. The default is common to all methods here; the
     official rasterizer of 3DGS has 0.2."""
     antialiased: bool = False
@@ -51,6 +52,25 @@ class SplattingConfig:
     def __post_init__(self) -> None:
         check_options(self)
         check_choice("length_unit", self.length_unit, ("world", "training"))
+        for place, rate in self._falling_rates().items():
+            if min(rate) < 0 or (0 in rate and any(rate)):
+                raise ConfigError(
+                    place,
+                    expected="a learning rate above 0 at the start and at the end, or 0 at both",
+                    found=f"{rate[0]:g} and {rate[1]:g}",
+                    todo="correct the value, or switch the rate off at both ends",
+                )
+
+    def _falling_rates(self) -> dict[str, tuple[float, float]]:
+        """Return learning rates at the start and at the end, by the names of their options."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        rates = {name: value for name, value in values.items() if name.endswith("_lr")}
+        found = {name: rate for name, rate in rates.items() if isinstance(rate, tuple)}
+        for start in values:
+            if start.endswith("_lr_initial"):
+                end = start.replace("_initial", "_final")
+                found[f"{start}, {end}"] = values[start], values[end]
+        return found
 
     def in_training_frame(self, training_from_world: float) -> Self:
         """Return the same options with all lengths in units of the training frame.
