@@ -84,4 +84,4 @@ def test_what_is_not_finite_is_named() -> None:
 
 def test_a_near_plane_out_of_bounds_is_refused() -> None:
     with pytest.raises(ShapeError, match="near_plane"):
-        trainer_of({"near_plane": 0.0})
+        trainer_of({"near_plane": 1e-30})
