@@ -66,7 +66,7 @@ def test_reading_the_specs_imports_nothing_heavy() -> None:
         ),
         (
             {"near_plane": -1.0},
-            "near_plane: expected a value greater than or equal to 0, found -1.0",
+            "near_plane: expected a value greater than 0, found -1.0",
         ),
         ({"density_interval": 0}, "density_interval: expected a value greater than 0, found 0"),
     ],
