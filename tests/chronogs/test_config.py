@@ -64,10 +64,7 @@ def test_reading_the_specs_imports_nothing_heavy() -> None:
             {"voxel_size": -1.0},
             "voxel_size: expected a value greater than or equal to 0, found -1.0",
         ),
-        (
-            {"near_plane": -1.0},
-            "near_plane: expected a value greater than 0, found -1.0",
-        ),
+        ({"near_plane": -1.0}, "near_plane: expected a value greater than 0, found -1.0"),
         ({"density_interval": 0}, "density_interval: expected a value greater than 0, found 0"),
     ],
 )

@@ -83,7 +83,8 @@ def print_runs(out: Path, new: Collection[Path] | None = None) -> None:
     records, failures = read_runs([out])
     text = format_runs(records, failures, "table", width=terminal_width(None))
     emit(text + "\n", None)
-    scenes = {run.scene for run in records if new is None or run.folder in new}
+    places = None if new is None else {path.resolve() for path in new}
+    scenes = {r.scene for r in records if places is None or r.folder.resolve() in places}
     drawn = [run for run in records if run.scene in scenes]
     figures = [*draw_figures(out, drawn), *draw_stages(out, drawn), *draw_sharing(out, records)]
     emit("".join(f"{path}\n" for path in (out / RESULTS_FILE, out / ROWS_FILE, *figures)), None)

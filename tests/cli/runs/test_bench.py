@@ -64,15 +64,17 @@ def test_bench_score_and_table(make_scene_folder, tmp_path, runs_here):
     assert macro == [record["aggregates"]["macro"]["psnr"]]
 
 
-def test_figures_are_drawn_of_the_scenes_of_the_bench_alone(make_scene_folder, tmp_path, runs_here):
-    runs = tmp_path / "runs"
-    options = ("--method", "toy_methods:MEAN", "--out", runs, "--threads", "1")
+def test_figures_are_drawn_of_the_scenes_of_the_bench_alone(
+    make_scene_folder, tmp_path, runs_here, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    options = ("--method", "toy_methods:MEAN", "--out", "runs", "--threads", "1")
     for name in ("place", "square"):
         done = chronoscene("bench", make_scene_folder(IMAGES, tests=TESTS, name=name), *options)
         assert done.exit_code == 0, done.stderr
         assert "place: PSNR [dB] (psnr), higher is better" in done.stdout
         drawn = [line for line in done.stdout.splitlines() if line.endswith(".png")]
-        assert drawn and all(f"{name}_" in line for line in drawn)
+        assert drawn and all(f"runs/figures/{name}_" in line for line in drawn)
 
 
 def test_runs_inside_a_scene_are_refused(make_scene_folder, tmp_path):
