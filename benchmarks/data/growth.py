@@ -36,12 +36,8 @@ POINTS = 500_000
 PRESET = "balanced"
 FRAMES = 24
 """Pictures of the animation."""
-MEASURES = (
-    ("CPU s", "cpu", 1, 0),
-    ("GB of memory", "together", 1, 2),
-    ("MB on disk", "disk", 1, 1),
-)
-"""Name, key, factor and digits."""
+MEASURES = (("CPU s", "cpu", 0), ("GB of memory", "together", 2), ("MB on disk", "disk", 1))
+"""Name, key and digits."""
 
 Figures = dict[str, dict[str, float]]
 """Of each command: elapsed and CPU seconds, gigabytes, and megabytes of what it wrote."""
@@ -78,7 +74,10 @@ def thin_out(whole: Path, folder: Path, photos: int) -> None:
 def commands(
     folder: Path, scene: Path, methods: Sequence[str], steps: int
 ) -> Iterator[tuple[str, Callable[[], list[str]], Callable[[], Path]]]:
-    """Name, arguments and output of each command, in an order in which they can run."""
+    """Name, arguments and output of each command, in an order in which they can run.
+
+    The first two write nothing: theirs is the scene.
+    """
     runs, out = folder / "runs", folder / "out" / scene.name
 
     def run() -> Path:
@@ -135,15 +134,15 @@ def table(figures: Mapping[int, Figures]) -> str:
     sizes = list(figures)
     growth = [f"{a} to {b}" for a, b in pairwise(sizes)]
     lines = []
-    for title, key, factor, digits in MEASURES:
+    for title, key, digits in MEASURES:
         heads = [f"{title}: {sizes[0]} photos", *(f"{n}" for n in sizes[1:]), *growth]
         lines += ["| | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
         for name in next(iter(figures.values())):
-            values = [factor * figures[n].get(name, {}).get(key, math.nan) for n in sizes]
-            texts = [f"{value:,.{digits}f}" for value in values]
+            values = [figures[n][name][key] if name in figures[n] else None for n in sizes]
+            texts = ["-" if value is None else f"{value:,.{digits}f}" for value in values]
             powers = [
-                f"{math.log(values[i + 1] / values[i]) / math.log(sizes[i + 1] / sizes[i]):.2f}"
-                for i in range(len(growth))
+                f"{math.log(b / a) / math.log(n / m):.2f}" if a and b else "-"
+                for (a, b), (m, n) in zip(pairwise(values), pairwise(sizes), strict=True)
             ]
             lines.append(f"| {name} | " + " | ".join([*texts, *powers]) + " |")
         lines.append("")
