@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import dataclass
+from typing import Any
 
 from chronoscene.methods import MethodSpec, ProgramConfig, Runner
 
@@ -89,17 +90,22 @@ SPLATFACTO = MethodSpec(
     ),
 )
 
+_OFFICIAL: dict[str, Any] = {
+    "period_input": "label",
+    "outputs": ("rgb",),
+    "devices": ("cuda",),
+    "method": "",
+    "presets": {"balanced": {}},
+}
+"""Properties that the official programs have in common."""
+
 CHRONOGS = MethodSpec(
     name="chronogs-official",
     title="ChronoGS (official)",
     paper="Wang et al., ChronoGS, CVPR 2026",
     licence="that of 3DGS: research and evaluation only",
-    period_input="label",
-    outputs=("rgb",),
-    devices=("cuda",),
-    method="",
     config="baselines.external:ChronoGSConfig",
-    presets={"balanced": {}},
+    **_OFFICIAL,
     runner=Runner(
         exports="chronoscene",
         prepare="baselines.external.prepare:chronogs",
@@ -122,12 +128,8 @@ FOUR_D_GAUSSIANS = MethodSpec(
     title="4DGaussians (official)",
     paper="Wu et al., 4D Gaussian Splatting for Real-Time Dynamic Scene Rendering, CVPR 2024",
     licence="that of 3DGS: research and evaluation only",
-    period_input="label",
-    outputs=("rgb",),
-    devices=("cuda",),
-    method="",
     config="baselines.external:FourDGaussiansConfig",
-    presets={"balanced": {}},
+    **_OFFICIAL,
     runner=Runner(
         exports="nerfstudio",
         prepare="baselines.external.prepare:four_d_gaussians",
@@ -156,12 +158,8 @@ CLNERF = MethodSpec(
     title="CLNeRF (official)",
     paper="Cai and Müller, CLNeRF: Continual Learning Meets NeRF, ICCV 2023",
     licence="Apache-2.0; its page says: for non-commercial use",
-    period_input="label",
-    outputs=("rgb",),
-    devices=("cuda",),
-    method="",
     config="baselines.external:CLNeRFConfig",
-    presets={"balanced": {}},
+    **_OFFICIAL,
     runner=Runner(
         exports="wat",
         prepare="baselines.external.prepare:clnerf",

@@ -17,7 +17,7 @@ import argparse
 import json
 import math
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -40,7 +40,7 @@ MEASURES = (("CPU s", "cpu", 0), ("GB of memory", "together", 2), ("MB on disk",
 """Name, key and digits."""
 
 Figures = dict[str, dict[str, float]]
-"""Of each command: elapsed and CPU seconds, gigabytes, and megabytes of what it wrote."""
+"""Elapsed and CPU seconds, gigabytes, and megabytes on the disk, by command."""
 
 
 def make_scene(folder: Path, photos: int) -> None:
@@ -73,40 +73,27 @@ def thin_out(whole: Path, folder: Path, photos: int) -> None:
 
 def commands(
     folder: Path, scene: Path, methods: Sequence[str], steps: int
-) -> Iterator[tuple[str, Callable[[], list[str]], Callable[[], Path]]]:
-    """Name, arguments and output of each command, in an order in which they can run.
+) -> Iterator[tuple[str, list[str], str]]:
+    """Name, arguments and output of each command; the output is a pattern below the folder.
 
-    The first two write nothing: theirs is the scene.
+    Each is made when those before have run, whose output it may need. The first two write nothing:
+    theirs is the scene.
     """
-    runs, out = folder / "runs", folder / "out" / scene.name
-
-    def run() -> Path:
-        pattern = f"{scene.name}/{methods[0]}-*{PRESET}*/seed0"
-        return next(path for path in sorted(runs.glob(pattern)) if "compressed" not in str(path))
-
-    def compressed() -> Path:
-        return next(runs.glob(f"{scene.name}/{methods[0]}-*compressed*/seed0/checkpoint"))
-
-    yield "validate", lambda: ["validate", str(scene)], lambda: scene
-    yield "stats", lambda: ["stats", str(scene)], lambda: scene
+    runs, out = f"runs/{scene.name}", f"out/{scene.name}"
+    yield "validate", ["validate", str(scene)], scene.name
+    yield "stats", ["stats", str(scene)], scene.name
     for method in methods:
         options = ["--method", method, "--preset", PRESET, "--iterations", str(steps)]
-        words = ["bench", str(scene), *options, "--out", str(runs)]
-        pattern = f"{scene.name}/{method}-*{PRESET}*/seed0/checkpoint"
-        yield (
-            f"bench, {method}",
-            lambda words=words: words,  # type: ignore[misc]
-            lambda pattern=pattern: next(runs.glob(pattern)),  # type: ignore[misc]
-        )
-    film = out / "film.mp4"
-    words = ["--cameras", "orbit", "--period", "0", "--frames", str(FRAMES), "--out", str(film)]
-    yield "render", lambda: ["render", str(run()), *words], lambda: film
-    yield "compress", lambda: ["compress", str(run())], compressed
-    model = out / "model.ply"
-    place = ["--period", "0", "--out", str(model)]
-    yield "export", lambda: ["export", str(run()), *place], lambda: model
-    page = out / "page"
-    yield "page", lambda: ["page", str(run()), "--out", str(page)], lambda: page
+        words = ["bench", str(scene), *options, "--out", str(folder / "runs")]
+        yield f"bench, {method}", words, f"{runs}/{method}-*{PRESET}*/seed0/checkpoint"
+    found = sorted(folder.glob(f"{runs}/{methods[0]}-*{PRESET}*/seed0"))
+    run = next(str(path) for path in found if "compressed" not in str(path))
+    film = ["--cameras", "orbit", "--period", "0", "--frames", str(FRAMES)]
+    yield "render", ["render", run, *film, "--out", f"{folder / out}/film.mp4"], f"{out}/film.mp4"
+    yield "compress", ["compress", run], f"{runs}/{methods[0]}-*compressed*/seed0/checkpoint"
+    model = ["--period", "0", "--out", f"{folder / out}/model.ply"]
+    yield "export", ["export", run, *model], f"{out}/model.ply"
+    yield "page", ["page", run, "--out", f"{folder / out}/page"], f"{out}/page"
 
 
 def measure(folder: Path, scene: Path, methods: Sequence[str], steps: int) -> Figures:
@@ -117,8 +104,8 @@ def measure(folder: Path, scene: Path, methods: Sequence[str], steps: int) -> Fi
     for name, arguments, output in commands(folder, scene, methods, steps):
         if name in figures:
             continue
-        found = asdict(measure_command(f"{name}, {scene.name}", arguments()))
-        figures[name] = {**found, "disk": size_of(output()) / 1e6}
+        found = asdict(measure_command(f"{name}, {scene.name}", arguments))
+        figures[name] = {**found, "disk": size_of(next(folder.glob(output))) / 1e6}
         file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
         print(scene.name, name, figures[name], flush=True)
     return figures
@@ -150,7 +137,7 @@ def table(figures: Mapping[int, Figures]) -> str:
 
 
 def about(scene: Path) -> str:
-    """What is in a scene, in a line."""
+    """Describe a scene in a line."""
     found = read_scene(scene)
     tests, points = len(found.select(split="test")), len(found.points)
     return f"{scene.name}: {len(found.frames)} photos, {tests} of them test views, {points} points"

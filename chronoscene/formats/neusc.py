@@ -57,7 +57,7 @@ LISTS = ("annots", "")
 
 def matches(path: Path) -> bool:
     """Return True if a folder has an undistorted model of dated images below ``dense/``."""
-    _, images = colmap_layout.scan(path / "dense/images")
+    _, images = colmap_layout.scan(path / PLACE[1])
     dated = any(re.match("[0-9]{4}-|none_", name, re.IGNORECASE) for name in images)
     return dated and find_model(path / "dense") is not None
 
@@ -70,7 +70,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
     dates = {name: when for name in used if (when := _date(path, name)) is not None}
     if not dates:
         raise SceneError(
-            path / "dense/images",
+            path / PLACE[1],
             expected="images with a date in their names",
             found="none after train.txt and trash.txt",
             todo="name images with their dates in train.txt, and not in trash.txt",
@@ -216,7 +216,7 @@ def _date(path: Path, name: str) -> date | None:
     except ValueError:
         pass  # no such day; reported below
     raise SceneError(
-        path / "dense/images" / name,
+        path / PLACE[1] / name,
         expected='a file name that begins with a date as in "2012-05-03_", or with "none_"',
         found=repr(prefix),
         todo="rename the image in the model, or list it in trash.txt",

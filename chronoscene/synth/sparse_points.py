@@ -80,9 +80,7 @@ def make_points(
     ]
     candidates = Candidates(*map(np.concatenate, zip(*found, strict=True)))
     views = _visibility(candidates, frames, renderers)
-    numbers = np.zeros(len(candidates.xyz), np.int64)
-    for view in views:
-        numbers[view.rows] += 1
+    numbers = np.bincount(np.concatenate([view.rows for view in views]))
     keep = np.flatnonzero(numbers >= MIN_TRACK_LENGTH)
     if len(keep) > settings.points:
         keep = np.sort(rng.choice(keep, settings.points, replace=False))
