@@ -209,14 +209,18 @@ def test_blocks_are_those_that_the_ellipse_touches(tools: SimpleNamespace) -> No
     binned = passes.Rendering(view)
     binned.bin_gaussians(gaussians, visible)
     listed = np.zeros((400, 3 * 32, 4 * 32), bool)
+    words, numbers = binned.entries
+    blocks_of, gaussians_of = (
+        words[:: layout.ENTRY_BLOCKS],
+        numbers[layout.GAUSSIAN :: layout.ENTRY_NUMBERS],
+    )
     for tile in range(view.tiles):
         y, x = 32 * (tile // view.tiles_x), 32 * (tile % view.tiles_x)
         for entry in range(binned.tiles[0][tile], binned.tiles[0][tile + 1]):
-            bits = np.unpackbits(
-                binned.entries[1][entry : entry + 1].view(np.uint8), bitorder="little"
-            )
+            word = blocks_of[entry : entry + 1].copy()
+            bits = np.unpackbits(word.view(np.uint8), bitorder="little")
             blocks = np.kron(bits.reshape(8, 8), np.ones((4, 4), np.uint8)).astype(bool)
-            listed[binned.entries[0][entry], y : y + 32, x : x + 32] |= blocks
+            listed[gaussians_of[entry], y : y + 32, x : x + 32] |= blocks
     needed = _touched(binned.records.reshape(-1, layout.RECORD), binned.keys >= 0)
     assert needed.any() and not (needed & ~listed[:, :70, :100]).any()
     in_blocks = np.pad(needed, ((0, 0), (0, 2), (0, 0))).reshape(400, 18, 4, 25, 4).any((2, 4))

@@ -81,7 +81,7 @@ def _list_part(first, last, at, limit, order, view, scene, counts, listed):
     """
     width, tiles_x = view
     records, records_int, row_bases = scene
-    list_tile, list_gaussian, list_blocks, list_row = listed
+    list_tile, (list_blocks, list_numbers) = listed
     counts[:] = 0
     for i in range(first, last):
         gaussian = order[i] & 0xFFFFFFFF
@@ -100,9 +100,10 @@ def _list_part(first, last, at, limit, order, view, scene, counts, listed):
                 if blocks != 0:
                     tile = tile_y * tiles_x + tile_x
                     list_tile[at] = tile
-                    list_gaussian[at] = gaussian
-                    list_blocks[at] = blocks
-                    list_row[at] = row
+                    list_blocks[layout.ENTRY_BLOCKS * at] = blocks
+                    number = layout.ENTRY_NUMBERS * at
+                    list_numbers[number + layout.GAUSSIAN] = gaussian
+                    list_numbers[number + layout.PLACE] = row
                     counts[tile] += 1
                     at += 1
                     row += 1
@@ -149,15 +150,14 @@ def _weight(count):
 
 @inner(fast_math=True)
 def _scatter_part(first, last, places, listed, entries):
-    list_tile, list_gaussian, list_blocks, list_row = listed
-    entry_gaussian, entry_blocks, entry_row = entries
+    list_tile, (source, _) = listed
+    target, _ = entries
     for j in range(first, last):
         tile = list_tile[j]
         place = places[tile]
         places[tile] = place + 1
-        entry_gaussian[place] = list_gaussian[j]
-        entry_blocks[place] = list_blocks[j]
-        entry_row[place] = list_row[j]
+        to, at = layout.ENTRY_BLOCKS * place, layout.ENTRY_BLOCKS * j
+        target[to], target[to + 1] = source[at], source[at + 1]
 
 
 @inner(fast_math=True)
@@ -200,9 +200,8 @@ def bin_gaussians(
             that is set to 1 if there was not enough room to list the pairs.
         parts: (where each part may write and the end, where it stopped). int64
         tiles: (scratch by part and tile int64, start of each tile and the end int64, order of
-            tiles int32, listed
-            (tile, gaussian, blocks, row), entries (gaussian, blocks, row)); the last is the result.
-            int32, blocks uint64
+            tiles int32, listed (tile int32, entries), entries); the last is the result. Entries are
+            the same memory as uint64 and as int32, see `layout`.
     """
     width, height, tiles_x = view
     _, row_bases = numbering

@@ -28,7 +28,7 @@ from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.cpu import layout
 from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, splat, splat_int
 
-AHEAD = 6  # Entries by which records are asked for in advance
+AHEAD = 12  # Entries by which records are asked for in advance
 STEPS = 32  # Scratch numbers of a Gaussian in a tile, see `start_gaussian`
 _STATE = 64  # Numbers per block: light, red, green, blue
 _STEPS = 64 * _STATE  # Where the steps are
@@ -37,6 +37,12 @@ FORWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 _lane_x = make_constant([i % 4 + 0.5 for i in range(LANES)])
 _lane_y = make_constant([i // 4 + 0.5 for i in range(LANES)])
 _block_steps = make_constant([4.0 * i for i in range(8)])
+
+
+@inlined
+def gaussian_of(numbers: Any, entry: Any) -> Any:
+    """The Gaussian of an entry."""
+    return numbers[layout.ENTRY_NUMBERS * entry + layout.GAUSSIAN]
 
 
 @inlined
@@ -144,16 +150,16 @@ def _forward_tile(start, end, left, top, active, plane, entries, records, planes
     down to those that were active, for the backward pass.
     """
     transmittance, last = planes
-    gaussians, blocks, _ = entries
+    blocks, numbers = entries
     for entry in range(start, end):
-        bits = blocks[entry] & active
-        blocks[entry] = bits
-        prefetch(records, layout.RECORD * gaussians[entry + AHEAD])
+        bits = blocks[layout.ENTRY_BLOCKS * entry] & active
+        blocks[layout.ENTRY_BLOCKS * entry] = bits
+        prefetch(records, layout.RECORD * gaussian_of(numbers, entry + AHEAD))
         if bits == 0:
             if active == 0:
                 return entry
             continue
-        record = layout.RECORD * gaussians[entry]
+        record = layout.RECORD * gaussian_of(numbers, entry)
         gaussian = start_gaussian(records, record, left, top, state, _STEPS)
         red, green, blue = color_of(records, record)
         while bits != 0:
@@ -228,8 +234,8 @@ def composite(
         size: (width, height) of the image in pixels.
         tiles: (first entry of each tile and the end of the last, where compositing stopped, which
             is written, order in which to take the tiles). int64, int64, int32
-        entries: (Gaussian, blocks, row) of each entry, the first readable a little past the end;
-            blocks are cut down to those that were active. int32, uint64, int32
+        entries: As uint64 and as int32, see `layout`, readable a little past the end; blocks are
+            cut down to those that were active.
         records: See `layout`.
         planes: (transmittance, end of the entries that count), by tile, written.
         states: Scratch, `FORWARD_NUMBERS` per worker.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.kernels.compilation import inlined, inner, kernel
 from chronoscene.kernels.memory import prefetch, prefetch_write, store
 from chronoscene.kernels.thread_pool import draw
 from chronoscene.kernels.transposes import make_load_pixels, store_sums
@@ -16,6 +18,7 @@ from chronoscene.rasterizer.cpu.composite import (
     AHEAD,
     STEPS,
     color_of,
+    gaussian_of,
     power_at,
     slopes,
     start_gaussian,
@@ -28,6 +31,12 @@ _STEPS = 64 * _STATE  # Where the steps are
 BACKWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 
 _load_rgb, _load_alpha = make_load_pixels(3, LANES), make_load_pixels(1, LANES)
+
+
+@inlined
+def _place_of(numbers: Any, entry: Any) -> Any:
+    """The row of sums of an entry."""
+    return numbers[layout.ENTRY_NUMBERS * entry + layout.PLACE]
 
 
 @inner(fast_math=True)
@@ -79,16 +88,16 @@ def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, r
     unit light: d loss / d alpha = T (c . grad - B); behind the next one in front,
     B' = B + alpha (c . grad - B). The type of ``absgrad`` says what is compiled.
     """
-    gaussians, blocks, places = entries
+    blocks, numbers = entries
     for k in range(stop - start):
         entry = stop - 1 - k
-        bits = blocks[entry]
+        bits = blocks[layout.ENTRY_BLOCKS * entry]
         ahead = max(entry - AHEAD, 0)
-        prefetch(records, layout.RECORD * gaussians[ahead])
-        prefetch_write(rows, layout.RECORD * places[ahead])
+        prefetch(records, layout.RECORD * gaussian_of(numbers, ahead))
+        prefetch_write(rows, layout.RECORD * _place_of(numbers, ahead))
         if bits == 0:
             continue
-        record = layout.RECORD * gaussians[entry]
+        record = layout.RECORD * gaussian_of(numbers, entry)
         gaussian = start_gaussian(records, record, left, top, state, _STEPS)
         red, green, blue = color_of(records, record)
         s = su = sv = suu = suv = svv = sr = sg = sb = splat(np.float32(0.0))
@@ -128,7 +137,7 @@ def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, r
                 if len(absgrad) > 0:
                     sx = sx + absolute(gu * slope[0] + gv * slope[2])
                     sy = sy + absolute(gu * slope[1] + gv * slope[3])
-        place = places[entry]
+        place = _place_of(numbers, entry)
         touched[place] = 1
         store_sums(rows, layout.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
         rows[layout.RECORD * place + layout.SUM_SIGN] = records[record + layout.V]

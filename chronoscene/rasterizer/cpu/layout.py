@@ -53,6 +53,11 @@ SUM, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_COLOR = 0, 1, 2, 3, 4, 5, 6
 SUM_SIGN = 9
 SUM_ABSOLUTE = 10  # Two numbers
 
+# An entry is a (Gaussian, tile) pair in 16 bytes, so that sorting moves one piece of memory: the
+# blocks as one 64-bit number, then two of 32 bits, the Gaussian and its row of sums.
+ENTRY_BLOCKS, ENTRY_NUMBERS = 2, 4  # An entry in numbers of 64 and of 32 bits
+GAUSSIAN, PLACE = 2, 3  # Numbers of 32 bits
+
 LOG2_E = math.log2(math.e)
 LEVEL_MIN = math.log2(ALPHA_MIN)  # LEVEL - u^2 - v^2 is at least this where alpha counts
 WHITEN = math.sqrt(0.5 * LOG2_E)  # u and v over WHITEN are standard deviations

@@ -82,9 +82,9 @@ class Rendering:
     tiles: tuple[AnyArray, AnyArray, AnyArray]
     """First entry of each tile and the end of all, where its compositing stopped, and the order in
     which to take tiles."""
-    entries: tuple[AnyArray, AnyArray, AnyArray]
-    """Gaussian, blocks and row of each (Gaussian, tile) pair, by tile, then by depth; with room
-    beyond the last."""
+    entries: tuple[AnyArray, AnyArray]
+    """The (Gaussian, tile) pairs by tile, then by depth, with room beyond the last: the same memory
+    as uint64 and as int32, see `layout`."""
     planes: tuple[AnyArray, AnyArray]
     """Transmittance, and the end of the entries that count, of each pixel, by tile."""
 
@@ -154,20 +154,13 @@ class Rendering:
         pixels = view.tiles * layout.TILE_PIXELS
         self.planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
 
-    def _make_lists(self, room: int) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
+    def _make_lists(self, room: int) -> tuple[AnyArray, tuple[AnyArray, AnyArray]]:
         """Memory for (Gaussian, tile) pairs by part, which is returned, and by tile."""
         w = self.workspace.array
-        self.entries = (
-            w("entry_gaussian", room + _MARGIN, np.int32),
-            w("entry_blocks", room, np.uint64),
-            w("entry_row", room + _MARGIN, np.int32),
-        )
-        return (
-            w("list_tile", room, np.int32),
-            w("list_gaussian", room, np.int32),
-            w("list_blocks", room, np.uint64),
-            w("list_row", room, np.int32),
-        )
+        entries = w("entries", layout.ENTRY_BLOCKS * (room + _MARGIN), np.uint64)
+        self.entries = entries, entries.view(np.int32)
+        listed = w("listed", layout.ENTRY_BLOCKS * room, np.uint64)
+        return w("list_tile", room, np.int32), (listed, listed.view(np.int32))
 
     def _launch_tiles(self, kernel: Any, scratch: tuple[str, int], *args: Any) -> None:
         """Run a kernel over the tiles, with scratch numbers for each worker."""
