@@ -31,6 +31,18 @@ RIDGE = 0.01
 """Penalty on the squares of all coefficients but the constant one, as a share of all weights."""
 MIN_WEIGHT = 1e-3
 """Pixels that a Gaussian must fill, over all views together, to be kept."""
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "total": (),
+    "light": (),
+    "means": (3,),
+    "log_scales": (3,),
+    "dyads": (4, 4),
+    "normal": (NUM_BASES, NUM_BASES),
+    "moments": (NUM_BASES, 3),
+}
+"""Shapes of the sums of a Gaussian."""
+_GROWTH = 1.25
+_AT_A_TIME = 1 << 16  # Gaussians that are solved for together, so that copies stay small
 
 
 def bake(model: AnchorModel, period_weights: Tensor, views: Sequence[View]) -> GaussianCloud:
@@ -41,38 +53,71 @@ def bake(model: AnchorModel, period_weights: Tensor, views: Sequence[View]) -> G
         period_weights: Of the period, see `chronoscene.training.periods`. [T]
         views: Where the result is to be right.
     """
-    totals = torch.zeros(len(model) * model.layout.offsets)
+    sums = _Sums(len(model) * model.layout.offsets)
     for view in views:
-        rows, _, weights = _seen(model, period_weights, view)
-        totals[rows] += weights
-    kept = totals > MIN_WEIGHT
-    place, count = kept.cumsum(0) - 1, int(kept.sum())
-    means, log_scales, light = torch.zeros(count, 3), torch.zeros(count, 3), torch.zeros(count)
-    dyads, moments = torch.zeros(count, 4, 4), torch.zeros(count, NUM_BASES, 3)
-    normal = torch.zeros(count, NUM_BASES, NUM_BASES)
-    for view in views:  # again, as all that all views decode may not fit into memory
-        rows, splats, weights = _seen(model, period_weights, view)
-        used = kept[rows]
-        at, w = place[rows[used]], weights[used]
-        splats = Splats(*(value[used] for value in splats))
-        means[at] = splats.means  # the same in all views
-        log_scales[at] += w[:, None] * splats.scales.log()
-        dyads[at] += w[:, None, None] * splats.quats[:, :, None] * splats.quats[:, None, :]
-        light[at] += w / splats.opacities
+        sums.add(view, *_seen(model, period_weights, view))
+    return sums.gaussians()
+
+
+class _Sums:
+    """Sums over views for each Gaussian that any of them shows, in the order in which they appear.
+
+    Args:
+        rows: Number of Gaussians that the model can decode.
+    """
+
+    def __init__(self, rows: int) -> None:
+        self._places = torch.full((rows,), -1)
+        self._count = 0
+        self._sums = {name: torch.empty(0, *shape) for name, shape in _SHAPES.items()}
+
+    def add(self, view: View, rows: Tensor, splats: Splats, weights: Tensor) -> None:
+        """Add what a view shows, see `_seen`."""
+        at, sums = self._places_of(rows), self._sums
+        sums["total"][at] += weights
+        sums["light"][at] += weights / splats.opacities
+        sums["means"][at] = splats.means  # the same in all views
+        sums["log_scales"][at] += weights[:, None] * splats.scales.log()
+        sums["dyads"][at] += (
+            weights[:, None, None] * splats.quats[:, :, None] * splats.quats[:, None]
+        )
         directions = torch.nn.functional.normalize(splats.means - camera_centre_tensor(view))
-        arrays = (at, w, basis(directions, MAX_DEGREE), splats.colors - 0.5, normal, moments)
+        values, targets = basis(directions, MAX_DEGREE), splats.colors - 0.5
+        arrays = (at, weights, values, targets, sums["normal"], sums["moments"])
         _add(*(array.numpy() for array in arrays))
-    total = totals[kept]
-    diagonal = normal.diagonal(dim1=1, dim2=2)
-    diagonal[:, 1:] += RIDGE * total[:, None]
-    tensors = (
-        means,
-        torch.linalg.eigh(dyads).eigenvectors[:, :, -1],
-        (log_scales / total[:, None]).exp(),
-        total / light,
-        torch.linalg.solve(normal, moments),
-    )
-    return GaussianCloud(*(tensor.contiguous().numpy() for tensor in tensors))
+
+    def gaussians(self) -> GaussianCloud:
+        """Return the Gaussians that fill enough pixels, in the order of the model."""
+        places = self._places[self._places >= 0]
+        kept = places[self._sums["total"][places] > MIN_WEIGHT]
+        parts = zip(*map(self._solved, kept.split(_AT_A_TIME)), strict=True)
+        return GaussianCloud(*(torch.cat(part).contiguous().numpy() for part in parts))
+
+    def _places_of(self, rows: Tensor) -> Tensor:
+        """Return the places of Gaussians in the sums; those that are new get one."""
+        new = rows[self._places[rows] < 0]
+        self._places[new] = torch.arange(self._count, self._count + len(new))
+        self._count += len(new)
+        room = len(self._sums["total"])
+        if self._count > room:
+            more = int(_GROWTH * self._count) - room
+            for name, shape in _SHAPES.items():
+                self._sums[name] = torch.cat([self._sums[name], torch.zeros(more, *shape)])
+        return self._places[rows]
+
+    def _solved(self, at: Tensor) -> tuple[Tensor, ...]:
+        """Return means, quaternions, scales, opacities and harmonics."""
+        found = {name: values[at] for name, values in self._sums.items()}
+        total, normal = found["total"], found["normal"]
+        diagonal = normal.diagonal(dim1=1, dim2=2)
+        diagonal[:, 1:] += RIDGE * total[:, None]
+        return (
+            found["means"],
+            torch.linalg.eigh(found["dyads"]).eigenvectors[:, :, -1],
+            (found["log_scales"] / total[:, None]).exp(),
+            total / found["light"],
+            torch.linalg.solve(normal, found["moments"]),
+        )
 
 
 def _seen(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tensor, Splats, Tensor]:
