@@ -19,9 +19,8 @@ CONTAINER = Path("/sys/fs/cgroup")
 GSPLAT_ALPHA_MAX = {"1.5": 0.999, "1.6": 0.99}
 """Cap of alpha in the kernels of gsplat, by version. Others were not looked at and are refused."""
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _KEPT_BYTES = 256 << 20
-_MAX_MMAP_THRESHOLD = 32 << 20  # The largest that glibc accepts
 
 
 def available_threads() -> int:
@@ -87,11 +86,11 @@ def set_threads(count: int | None = None) -> int:
 
 
 def keep_freed_memory() -> bool:
-    """Keep freed memory for the next request, up to 256 MB. Does nothing except with glibc.
+    """Keep freed memory for the next request, up to 256 MB at its end. Only glibc can.
 
-    A training step allocates the same tens of megabytes as the one before it. By default glibc
-    returns such blocks to the kernel, which clears every page anew: measured at about 2 ms of a
-    step of 26 ms.
+    A training step allocates the same memory as the one before it, tens to hundreds of megabytes.
+    By default glibc returns large blocks to the system, which clears every page anew: measured at
+    2 ms of a step of 26 ms, and at a tenth to a quarter where photos or models are large.
 
     Returns:
         Whether the C library has taken the setting.
@@ -102,9 +101,8 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # another C library
         return False
-    return bool(
-        mallopt(_M_MMAP_THRESHOLD, _MAX_MMAP_THRESHOLD) and mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
-    )
+    # No block of its own for what is large: the threshold for that cannot be above 32 MB.
+    return bool(mallopt(_M_MMAP_MAX, 0) and mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES))
 
 
 def check_device(device: str, *, gsplat: bool = True) -> None:

@@ -21,6 +21,7 @@ def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 def touch():
     blocks = [np.ones(1_000_000) for _ in range(8)]  # 64 MB
+    blocks.append(np.ones(12_000_000))  # 96 MB at once
 touch()
 before = faults()
 touch()
