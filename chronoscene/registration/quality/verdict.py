@@ -115,7 +115,7 @@ THRESHOLDS: dict[str, Threshold] = {
         todo=_WORST,
     ),
     "excess": Threshold(
-        what="held-out residual beyond the noise of matching, as an angle",
+        what="residual of ties and held-out tracks beyond the noise of matching, as an angle",
         unit="degrees", doubtful=0.04, fail=0.4,
         why="errors that no similarity explains come from drift that deforms a period (doming), "
         "which turns images by twice as much, or from a wrong camera",
@@ -203,7 +203,7 @@ THRESHOLDS: dict[str, Threshold] = {
 FITTED = 1.3
 """Upper limit of the ratio of the noise of an observation to its residual after fitting."""
 
-FEW_TRACKS = 4  # Held-out tracks that support other evidence where they are too few to measure
+FEW_TRACKS = 4  # Held-out tracks whose agreement counts where they are too few to measure
 FEW_AGREEING = 0.5  # Share of their observations that agrees
 FACING = 0.8
 """Share of the error of localised images that counts in forward-facing captures: turns and shifts
@@ -391,9 +391,7 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
-def _contradiction(
-    certificate: Certificate, pair: PairFigures, place: str
-) -> Iterator[Objection]:
+def _contradiction(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
     """Judge surfaces that contradict the matches, and are shifted, or misaligned by themselves."""
     assert isinstance(pair.surfaces, SurfaceDistance)
     alone = _of_limits(certificate, pair.by_surfaces)
@@ -449,13 +447,13 @@ def _localised(found: Localisation, certificate: Certificate) -> float:
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
     """Judge the alignment of two periods, and its uncertainty.
 
-    They are misaligned if the interval of all ties lies beyond the limit, or that of held-out
-    tracks and the estimate of all ties: one interval in twenty misses the truth by chance.
+    They are misaligned if the interval of all ties (and that of ties and surfaces) lies beyond the
+    limit, or that of held-out tracks and the estimate of all ties: one interval in twenty misses
+    the truth by chance.
     They are aligned if the interval of the precise measurement (all ties, and the surfaces) ends
     below the limit, and an independent one (held-out tracks, and the surfaces) agrees: its interval
     ends below the limit, or its estimate lies below it and its interval ends below twice the limit.
-    Where it is wider, with its estimate below the limit, surfaces must confirm a precise
-    measurement with a margin.
+    Where it is wider, with its estimate below the limit, surfaces alone must confirm the ties.
     """
     held, by_all = pair.misalignment, pair.by_all
     confirmed = _confirmed(certificate, pair)
@@ -502,7 +500,7 @@ def _high(interval: Interval) -> float:
 
 
 def _confirmed(certificate: Certificate, pair: PairFigures) -> bool:
-    """True if surfaces confirm the ties, and held-out tracks support them.
+    """True if surfaces confirm the ties, and no held-out tracks deny them.
 
     Surfaces exclude a step of repeated structure; how far few ties determine the rotation is then
     a question of their noise, which the interval answers.
@@ -602,7 +600,8 @@ def _words(certificate: Certificate, level: Level, objections: list[Objection]) 
     if level == "pass":
         return (
             f"The {count} periods lie in one frame, within 0.1 degrees and 0.2% of the scene's "
-            "extent of each other, according to matches that took no part in the estimation."
+            "extent of each other, according to matches or surfaces that took no part in the "
+            "estimation."
         )
     first = objections[0]
     start = (
