@@ -395,7 +395,7 @@ def _contradiction(certificate: Certificate, pair: PairFigures, place: str) -> I
     """Judge surfaces that contradict the matches, and are shifted, or misaligned by themselves."""
     assert isinstance(pair.surfaces, SurfaceDistance)
     alone = _of_limits(certificate, pair.by_surfaces)
-    off = pair.surfaces.shift.low > 0 or any(x.value > 1 for x in alone)
+    off = pair.surfaces.shift.low > 0 or any(x.low > 1 for x in alone)
     if off and _contradicted(pair):
         found = "the surfaces are shifted, and contradict the matches (Hotelling, 99 %)"
         yield Objection("doubtful", "clouds", place, found, THRESHOLDS["clouds"].why, _LOOK)
