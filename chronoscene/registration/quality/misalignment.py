@@ -19,8 +19,8 @@ from chronoscene.scene.similarity import Sim3, fit_robustly
 MIN_TRACKS = 12  # Fewer tracks do not determine seven unknowns and their spread
 
 SPENT = 9
-"""What the tracks that give the covariance count less: seven unknowns were fitted, and the t
-distribution of what is left has a variance from two more on."""
+"""Tracks that a covariance costs: seven unknowns were fitted, and the t distribution of what is
+left has a variance from two more on."""
 
 STEPS = 12
 DRAWS = 400  # Random motions that give the spread of an angle or a distance
