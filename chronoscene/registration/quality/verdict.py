@@ -214,9 +214,10 @@ images agree on it."""
 SURELY = 1.5
 """Limits within which the interval of the surfaces must end, with its middle below them, to confirm
 what the ties determine more precisely."""
-ROOM, FACING_ROOM = 0.95, 0.8
-"""Shares of the limits within which an interval must end, the second in a forward-facing capture:
-one in forty ends below the truth, most of them by little."""
+ROOM, MARGIN = 0.95, 0.8
+"""Shares of the limits within which an interval must end: one in forty ends below the truth, most
+of them by little. The second is that of forward-facing captures, and of intervals that only
+surfaces narrow so far, as neighbouring patches of real surfaces can err together."""
 
 MIN_TIES = 3  # Tie points, clicked ones for example, that two periods need to be linked
 
@@ -477,7 +478,7 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
         loose, estimate = one.high * factor, one.value * factor
         beyond = loose > limit and estimate > limit  # Nothing confirms what this contradicts
         # Forward-facing cameras leave depths open, which errors of their poses bend.
-        room = (FACING_ROOM if certificate.facing else ROOM) * limit
+        room = (ROOM if every.high * factor <= limit and not certificate.facing else MARGIN) * limit
         if high > room or beyond or (loose > 2 * limit and not confirmed):
             t = THRESHOLDS[key]
             found = (

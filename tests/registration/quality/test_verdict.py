@@ -494,7 +494,7 @@ def test_an_error_far_below_the_noise_counts_only_if_the_images_agree_on_it() ->
 
 def test_surfaces_narrow_what_ties_leave_open() -> None:
     wide = with_part(made(), "by_all", rotation=Interval(0.04, 0.0, 0.3))
-    both = (Interval(0.03, 0.0, 0.0949), Interval(0.03, 0.0, 0.06))
+    both = (Interval(0.03, 0.0, 0.0799), Interval(0.03, 0.0, 0.06))
     assert judge(with_pair(wide, by_ties_and_surfaces=both)).level == "pass"
     loose = with_part(made(), "misalignment", rotation=Interval(0.12, 0.0, 0.15))
     assert found(judge(with_pair(loose, independent=both))) == []
