@@ -305,12 +305,12 @@ def test_a_finding_states_the_limit_that_was_passed() -> None:
         assert objection.found.endswith(f": {agreeing}, expected at least {limit}")
     (objection,) = judge(with_gps(made(), median=14.0)).objections
     assert objection.found.endswith(": 14 m, expected at most 12")
-    for part in ("misalignment", "by_all"):
+    for part, limit in (("misalignment", "0.095"), ("by_all", "0.08")):
         wide = with_part(made(), part, rotation=Interval(0.04, 0.0, 0.3))
         (objection,) = judge(wide).objections
         assert objection.found.endswith(
             f": {0.04 if part == 'misalignment' else 0.03} degrees, but up to 0.3 cannot be ruled "
-            "out; expected at most 0.095"
+            f"out; expected at most {limit}"
         )
 
 
