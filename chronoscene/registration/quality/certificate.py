@@ -18,8 +18,10 @@ from chronoscene.registration.quality.disagreement import Disagreement, disagree
 from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
+    MAX_SEEN,
     Interval,
     Misalignment,
+    Motion,
     Transfers,
     measure,
     transfer_errors,
@@ -108,7 +110,10 @@ class PairFigures:
     by_ties_and_surfaces: tuple[Interval, Interval] | None = None
     """Rotation and displacement by `by_all` and the surfaces together."""
     independent: tuple[Interval, Interval] | None = None
-    """By held-out tracks and the surfaces together."""
+    """By held-out tracks and the surfaces together, or by the surfaces alone where held-out tracks
+    measure nothing."""
+    by_surfaces: tuple[Interval, Interval] | None = None
+    """By the surfaces alone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,8 +238,10 @@ def _pair(
     misalignment: Misalignment | str = nothing
     if good.any():
         figures = _held_out(moved, good, (placed_a, placed_b), _epipolar(model, evidence, periods))
-        measured = measure(moved, placed_a, placed_b, centres)
-        misalignment = measured or "held-out tracks are too few, or too close together"
+        misalignment = (
+            measure(moved, placed_a, placed_b, centres)
+            or "held-out tracks are too few, or too close together"
+        )
     by_all = measure(*_all_transfers(model, evidence, a, b), centres)
     of_a, of_b = (evidence.ties.where(model.periods[evidence.ties.image] == p) for p in periods)
     sigma = by_all.shift.high / 1.96 if by_all is not None else 0.0
@@ -244,11 +251,16 @@ def _pair(
         evidence.clouds[b],
         middle,
         sigma,
-        None if by_all is None else by_all.motion,
+        _motionless(model, evidence, a, centres) if by_all is None else by_all.motion,
     )
+    by_surfaces = None
+    if not isinstance(surfaces, str) and surfaces.motion is not None:
+        by_surfaces = surfaces.motion.intervals()
+    measured = isinstance(misalignment, Misalignment)
     return PairFigures(
         by_ties_and_surfaces=_with_surfaces(by_all, surfaces),
-        independent=_with_surfaces(misalignment, surfaces),
+        independent=_with_surfaces(misalignment, surfaces) if measured else by_surfaces,
+        by_surfaces=by_surfaces,
         a=a,
         b=b,
         ties=spread,
@@ -260,6 +272,17 @@ def _pair(
         localised_a=localise(of_a, evidence.ties_placed[b]),
         surfaces=surfaces,
     )
+
+
+def _motionless(
+    model: Registered, evidence: Evidence, period: int, centres: Array
+) -> Motion | None:
+    """Points of a period and its cameras, by which surfaces measure a motion where ties do not."""
+    rays = evidence.observed[period]
+    rays = rays.where(np.arange(0, len(rays), len(rays) // MAX_SEEN + 1))
+    if not len(rays):
+        return None
+    return Motion.none(model.points[rays.track], camera_centre(rays.pose), centres)
 
 
 def _with_surfaces(

@@ -18,6 +18,10 @@ from chronoscene.scene.similarity import Sim3, fit_robustly
 
 MIN_TRACKS = 12  # Fewer tracks do not determine seven unknowns and their spread
 
+SPENT = 9
+"""Tracks that a covariance costs: seven unknowns were fitted, and the t distribution of what is
+left has a variance from two more on."""
+
 STEPS = 12
 DRAWS = 400  # Random motions that give the spread of an angle or a distance
 
@@ -27,7 +31,7 @@ GROSS_PIXELS = 20.0
 CORE = 0.25
 """Share of the smallest residuals that gives the noise where false ties may be many."""
 
-CONTRADICTS = 18.5  # Chi-square of seven parameters, 99 %
+CONTRADICTS = 0.99  # Probability within which two estimates of seven parameters differ
 
 MAX_SEEN = 500  # Observations by which a change in depth is measured
 
@@ -80,6 +84,9 @@ class Misalignment:
     they see if that is larger, in world units."""
     motion: Motion
     """The estimate again, with its covariance."""
+    noise: float = 0.0
+    """Median residual of the observations that agree with it, in units of what the placing of the
+    point leaves open: pixels of one observation. What a deformed period adds to it stays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,6 +103,20 @@ class Motion:
     """Cameras whose displacement is measured. [C, 3]"""
     seen: Array
     """Points and the cameras that see them, whose depth is measured. [2, O, 3]"""
+    freedom: float = 1e9
+    """Degrees of freedom of the covariance."""
+
+    @classmethod
+    def none(cls, xyz: Array, cameras: Array, centres: Array) -> Motion:
+        """The identity, in a form that takes the parameters of another estimate.
+
+        Args:
+            xyz: Points whose depth is measured. [O, 3]
+            cameras: Those that see them. [O, 3]
+            centres: Cameras whose displacement is measured. [C, 3]
+        """
+        middle = np.median(xyz, axis=0)
+        return cls(np.zeros(7), np.eye(7), middle, centres, np.stack([xyz, cameras]))
 
     def similarity(self, step: Array) -> Sim3:
         """Motion with other parameters."""
@@ -123,9 +144,13 @@ class Motion:
 
     def joined(self, other: Motion) -> Motion | None:
         """Both estimates weighted by their information; None if they contradict each other."""
+        from scipy.stats import f
+
         other = other.about(self.middle)
         gap = self.step - other.step
-        if gap @ np.linalg.solve(self.covariance + other.covariance, gap) > CONTRADICTS:
+        freedom = min(self.freedom, other.freedom)
+        limit = 7 * float(f.ppf(CONTRADICTS, 7, freedom)) * (1 - 2 / freedom)  # Hotelling 1931
+        if gap @ np.linalg.solve(self.covariance + other.covariance, gap) > limit:
             return None
         mine, its = np.linalg.inv(self.covariance), np.linalg.inv(other.covariance)
         covariance = np.linalg.inv(mine + its)
@@ -231,7 +256,8 @@ def measure(
     """Estimate the similarity between two periods, with its uncertainty.
 
     Weights are those of a Cauchy distribution; the spread is that of a sandwich estimator whose
-    groups are tracks, so that ten images of one point do not count as ten points.
+    groups are tracks and images, so that ten images of one point do not count as ten points, nor
+    the points of one image as independent of its pose.
 
     Args:
         moved: From `transfers`.
@@ -243,7 +269,7 @@ def measure(
     Returns:
         None with fewer than `MIN_TRACKS` tracks, or if they do not determine the motion.
 
-    Source: Huber 1967 (sandwich); Liang and Zeger 1986 (groups).
+    Source: Huber 1967 (sandwich); Cameron, Gelbach and Miller 2011 (two kinds of groups).
     """
     if len(np.unique(moved.rays.track)) < MIN_TRACKS:
         return None
@@ -348,7 +374,8 @@ def _describe(
 ) -> Misalignment | None:
     residual, (jacobian, variance) = _residuals(moved, similarity, middle)
     weight, noise = _weights(residual, variance, core)
-    covariance = _sandwich(moved.rays.track, residual, jacobian, weight)
+    bread = _bread(residual, jacobian, weight)
+    covariance = _sandwich(moved.rays, residual, jacobian, weight, bread)
     if covariance is None:
         return None
     some = slice(None, None, len(moved) // MAX_SEEN + 1)
@@ -358,10 +385,24 @@ def _describe(
         middle=middle,
         centres=centres,
         seen=np.stack([moved.xyz[some], camera_centre(moved.rays.pose[some])]),
+        freedom=len(np.unique(moved.rays.track)) - 7,
     )
-    agreeing = (residual**2).sum(axis=1) < 9 * noise**2 * variance
+    error = np.linalg.norm(residual, axis=1) / np.sqrt(variance)
+    agreeing = error < 3 * noise
     tracks = len(np.unique(moved.rays.track[agreeing]))
-    return Misalignment(tracks, similarity, *motion.intervals(similarity), motion)
+    return Misalignment(
+        tracks, similarity, *motion.intervals(similarity), motion, _usual(error, 3 * noise)
+    )
+
+
+def _usual(error: Array, reach: float) -> float:
+    """Median of errors within three deviations, of a Rayleigh distribution with that median."""
+    median = 0.0
+    for _ in range(5):
+        inner = error[error < reach]
+        median = float(np.median(inner)) if len(inner) else median
+        reach = 3 * median / np.sqrt(2 * np.log(2))
+    return median
 
 
 def _parameters(similarity: Sim3, middle: Array) -> Array:
@@ -373,21 +414,58 @@ def _parameters(similarity: Sim3, middle: Array) -> Array:
     return np.concatenate([shift, turn, [np.log(similarity.scale)]])
 
 
-def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> Array | None:
-    """Covariance of the seven parameters, grouped by track."""
+def _bread(residual: Array, jacobian: Array, weight: Array) -> Array:
+    """Derivative of the weighted sum of residuals by the seven parameters. [7, 7]
+
+    Weights fall with the residual r, ``w = 1 / (v + r^2 / 4)`` for a variance v, so that one that
+    grows by dr pulls by less than ``w dr`` more: by ``w (I - w r r^T / 2) dr``.
+
+    Args:
+        residual: [O, 2]
+        jacobian: [O, 2, 7]
+        weight: [O]
+    """
     residual, jacobian = np.nan_to_num(residual), np.nan_to_num(jacobian)
     normal, _ = _sum(residual, jacobian, weight)
-    _, slot = np.unique(track, return_inverse=True)
-    groups = int(slot.max()) + 1
+    along = np.einsum("nki,nk->ni", jacobian, residual)
+    curved = normal - np.einsum("ni,n,nj->ij", along, weight**2 / 2, along)
+    # Where almost all is false, no maximum is near, and nothing is certain anyway.
+    return np.asarray(curved if np.linalg.eigvalsh(curved)[0] > 0 else normal)
+
+
+def _sandwich(
+    rays: TrackRays, residual: Array, jacobian: Array, weight: Array, normal: Array
+) -> Array | None:
+    """Covariance of the seven parameters, grouped by track, and by image.
+
+    Observations of a track share the error of its point, those of an image that of its pose.
+    """
+    from scipy.linalg import eigh
+
+    residual, jacobian = np.nan_to_num(residual), np.nan_to_num(jacobian)
     score = np.einsum("nki,n,nk->ni", jacobian, weight, residual)
-    sums = np.stack([np.bincount(slot, score[:, i], groups) for i in range(7)], axis=1)
-    if groups <= 7 or np.linalg.cond(normal) > 1e16:
+    sums, by_image = _grouped(score, rays.track), _grouped(score, rays.image)
+    groups = len(sums)
+    if groups <= SPENT or np.linalg.cond(normal) > 1e16:
         return None
+    meat = sums.T @ sums * groups / (groups - SPENT)
+    try:
+        shared, axes = eigh(by_image.T @ by_image - score.T @ score, meat)
+    except np.linalg.LinAlgError:
+        return None
+    # A pose errs where points are seen, and as much where they are placed by the same image.
+    some = meat @ axes * np.sqrt(4 * np.maximum(shared, 0.0))
     bread = np.linalg.inv(normal)
+    covariance = bread @ (meat + some @ some.T) @ bread
     # The noise of the pixels alone is a lower bound: few tracks can agree by chance.
-    covariance = bread @ (sums.T @ sums) @ bread * groups / (groups - 7)
     size = float(np.trace(covariance / np.maximum(np.diag(bread), 1e-300)[:, None])) / 7
     return np.asarray((1.0 / size if 0 < size < 1 else 1.0) * covariance)
+
+
+def _grouped(score: Array, group: Ints) -> Array:
+    """Sums over groups. [O, 7] -> [G, 7]"""
+    _, slot = np.unique(group, return_inverse=True)
+    return np.stack([np.bincount(slot, column) for column in score.T], axis=1)
 
 
 def _interval(estimate: Array, drawn: Array, noise: Array) -> Interval:

@@ -115,7 +115,7 @@ THRESHOLDS: dict[str, Threshold] = {
         todo=_WORST,
     ),
     "excess": Threshold(
-        what="held-out residual beyond the noise of matching, as an angle",
+        what="residual of ties and held-out tracks beyond the noise of matching, as an angle",
         unit="degrees", doubtful=0.04, fail=0.4,
         why="errors that no similarity explains come from drift that deforms a period (doming), "
         "which turns images by twice as much, or from a wrong camera",
@@ -203,18 +203,21 @@ THRESHOLDS: dict[str, Threshold] = {
 FITTED = 1.3
 """Upper limit of the ratio of the noise of an observation to its residual after fitting."""
 
-FEW_TRACKS = 4  # Held-out tracks that support other evidence where they are too few to measure
+FEW_TRACKS = 4  # Held-out tracks whose agreement counts where they are too few to measure
 FEW_AGREEING = 0.5  # Share of their observations that agrees
 FACING = 0.8
 """Share of the error of localised images that counts in forward-facing captures: turns and shifts
 of a camera make up for each other there."""
-VAGUE = 1.5
+VAGUE = 1.0
 """Noise of a localised image, in units of the limits, beyond which its error counts only where the
 images agree on it."""
-FEW_LOCALISED = 3  # Images that surfaces and ties need for confirmation, of both periods together
-MARGIN = 0.8
-"""Share of the limits within which an interval must end that other evidence confirms, or that of a
-forward-facing capture."""
+SURELY = 1.5
+"""Limits within which the interval of the surfaces must end, with its middle below them, to confirm
+what the ties determine more precisely."""
+ROOM, MARGIN = 0.95, 0.8
+"""Shares of the limits within which an interval must end: one in forty ends below the truth, most
+of them by little. The second is that of forward-facing captures, and of intervals that only
+surfaces narrow so far, as neighbouring patches of real surfaces can err together."""
 
 MIN_TIES = 3  # Tie points, clicked ones for example, that two periods need to be linked
 
@@ -268,6 +271,9 @@ def judge(certificate: Certificate) -> Verdict:
         pairs[pair.a, pair.b] = worst_level(f.level for f in mine) if linked else None
         objections += mine if linked else []
     good = _bounds(certificate, [k for k, level in pairs.items() if level == "pass"])
+    for pair in certificate.pairs:  # what surfaces measure is no longer a question of the chain
+        if np.isfinite(good[pair.a, pair.b]) and _surfaces_fit(certificate, pair):
+            good[pair.a, pair.b] = min(good[pair.a, pair.b], 1.0)
     if all(good[k] <= 1 or level == "pass" for k, level in pairs.items()):
         # Chains of good pairs that link all periods supply what single pairs lack.
         objections = [o for o in objections if o.level == "fail" or o.check not in LACKING]
@@ -363,30 +369,48 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
     yield from _alignment(certificate, pair, place)
     if not isinstance(pair.held_out, str) and pair.held_out.tracks >= MIN_TRACKS:
         held = pair.held_out
-        yield from _check("agreeing", held.agreeing, place)
-        yield from _check("together", (1 - held.agreeing) * held.disagreement.step, place)
+        others = [*_check("agreeing", held.agreeing, place)]
+        others += _check("together", (1 - held.agreeing) * held.disagreement.step, place)
+        # Surfaces that measure the alignment by themselves tell which of the matches are right.
+        refuted = _surfaces_fit(certificate, pair)
+        yield from others if not refuted else ()
         yield from _check("gathered", (1 - held.agreeing) * held.disagreement.images, place)
         yield from _check("excess", _excess(certificate, pair), place)
     if not _confirmed(certificate, pair):
         yield from _check("occupied", pair.ties.occupied, place)
-    yield from _check("tied", min(pair.ties.tied_a, pair.ties.tied_b), place)
+        yield from _check("tied", min(pair.ties.tied_a, pair.ties.tied_b), place)
     for found in (pair.localised_b, pair.localised_a):
         if isinstance(found, Localisation) and found.images >= 3:
             yield from _check("localised", _localised(found, certificate), place)
     if isinstance(pair.surfaces, SurfaceDistance):
-        shift = pair.surfaces.shift
+        shift, moved = pair.surfaces.shift, 0.0
         if shift.low > 0:
-            against = list(_check("clouds", 100 * shift.value / certificate.extent, place))
-            yield from against or _contradiction(pair, place)
+            moved = 100 * shift.value / certificate.extent
+        against = list(_check("clouds", moved, place))
+        yield from against or _contradiction(certificate, pair, place)
         yield from _check("open", 100 * shift.high / certificate.extent, place)
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
-def _contradiction(pair: PairFigures, place: str) -> Iterator[Objection]:
-    """Judge surfaces that are shifted by less than the limit, but against the matches."""
-    if _contradicted(pair):
-        found = "the surfaces are shifted, and contradict the matches (chi-square, 99 %)"
+def _contradiction(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
+    """Judge surfaces that contradict the matches, and are shifted, or misaligned by themselves."""
+    assert isinstance(pair.surfaces, SurfaceDistance)
+    alone = _of_limits(certificate, pair.by_surfaces)
+    off = pair.surfaces.shift.low > 0 or any(x.low > 1 for x in alone)
+    if off and _contradicted(pair):
+        found = "the surfaces are shifted, and contradict the matches (Hotelling, 99 %)"
         yield Objection("doubtful", "clouds", place, found, THRESHOLDS["clouds"].why, _LOOK)
+
+
+def _of_limits(
+    certificate: Certificate, found: tuple[Interval, Interval] | None
+) -> tuple[Interval, ...]:
+    """Rotation and displacement in units of their limits; nothing if they are not measured."""
+    factors = 1 / _limit("rotation"), 100 / certificate.extent / _limit("shift")
+    return tuple(
+        Interval(*(factor * x for x in (one.value, one.low, one.high)))
+        for one, factor in zip(found or (), factors, strict=False)
+    )
 
 
 def _contradicted(pair: PairFigures) -> bool:
@@ -424,13 +448,13 @@ def _localised(found: Localisation, certificate: Certificate) -> float:
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
     """Judge the alignment of two periods, and its uncertainty.
 
-    They are misaligned if the interval of all ties lies beyond the limit, or that of held-out
-    tracks and the estimate of all ties: one interval in twenty misses the truth by chance.
+    They are misaligned if the interval of all ties (and that of ties and surfaces) lies beyond the
+    limit, or that of held-out tracks and the estimate of all ties: one interval in twenty misses
+    the truth by chance.
     They are aligned if the interval of the precise measurement (all ties, and the surfaces) ends
     below the limit, and an independent one (held-out tracks, and the surfaces) agrees: its interval
     ends below the limit, or its estimate lies below it and its interval ends below twice the limit.
-    Where it is wider, with its estimate below the limit, surfaces must confirm a precise
-    measurement with a margin.
+    Where it is wider, with its estimate below the limit, surfaces alone must confirm the ties.
     """
     held, by_all = pair.misalignment, pair.by_all
     confirmed = _confirmed(certificate, pair)
@@ -444,7 +468,9 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
         limit, every = _limit(key), getattr(by_all, key)
         one = every if isinstance(held, str) else getattr(held, key)
         high = _precise(pair)[i].high * factor
-        if max(every.low, min(one.low, every.value)) * factor > limit:
+        both = pair.by_ties_and_surfaces
+        low = every.low if both is None else min(every.low, both[i].low)
+        if max(low, min(one.low, every.value)) * factor > limit:
             yield from _check(key, max(one.value, every.value) * factor, place)
             continue
         if pair.independent is not None:
@@ -452,7 +478,7 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
         loose, estimate = one.high * factor, one.value * factor
         beyond = loose > limit and estimate > limit  # Nothing confirms what this contradicts
         # Forward-facing cameras leave depths open, which errors of their poses bend.
-        room = MARGIN * limit if certificate.facing else limit
+        room = (ROOM if every.high * factor <= limit and not certificate.facing else MARGIN) * limit
         if high > room or beyond or (loose > 2 * limit and not confirmed):
             t = THRESHOLDS[key]
             found = (
@@ -475,27 +501,22 @@ def _high(interval: Interval) -> float:
 
 
 def _confirmed(certificate: Certificate, pair: PairFigures) -> bool:
-    """True if surfaces and localised images confirm precise ties, and held-out tracks support them.
+    """True if surfaces confirm the ties, and no held-out tracks deny them.
 
     Surfaces exclude a step of repeated structure; how far few ties determine the rotation is then
     a question of their noise, which the interval answers.
     """
-    held, surfaces = pair.held_out, pair.surfaces
-    if isinstance(pair.by_all, str) or isinstance(surfaces, str) or isinstance(held, str):
+    held = pair.held_out
+    if isinstance(held, str) or (held.tracks >= FEW_TRACKS and held.agreeing < FEW_AGREEING):
         return False
-    if _contradicted(pair):
-        return False
-    local = (pair.localised_a, pair.localised_b)
-    percent = 100 / certificate.extent
-    turn, shift = _precise(pair)
-    return (
-        held.tracks >= FEW_TRACKS
-        and held.agreeing >= FEW_AGREEING
-        and sum(x.images for x in local if isinstance(x, Localisation)) >= FEW_LOCALISED
-        and percent * surfaces.shift.high <= _limit("shift")
-        and turn.high <= MARGIN * _limit("rotation")
-        and percent * shift.high <= MARGIN * _limit("shift")
-    )
+    return _surfaces_fit(certificate, pair)
+
+
+def _surfaces_fit(certificate: Certificate, pair: PairFigures) -> bool:
+    """True if the surfaces alone measure the alignment, and find it within the limits."""
+    alone = _of_limits(certificate, pair.by_surfaces)
+    fit = all(x.value <= 1 and x.high <= SURELY for x in alone)
+    return bool(alone) and fit and not _contradicted(pair)
 
 
 def _limit(key: str) -> float:
@@ -510,7 +531,9 @@ def _excess(certificate: Certificate, pair: PairFigures) -> float:
     """
     assert not isinstance(pair.held_out, str)
     own = [certificate.periods[p].error or 0.0 for p in (pair.a, pair.b)]
-    beyond = np.sqrt(max(0.0, pair.held_out.noise**2 - (FITTED * max(own)) ** 2))
+    every = pair.by_all
+    noise = every.noise if isinstance(every, Misalignment) else pair.held_out.noise
+    beyond = np.sqrt(max(0.0, noise**2 - (FITTED * max(own)) ** 2))
     return float(np.degrees(np.arctan2(beyond, certificate.focal)))
 
 
@@ -578,7 +601,8 @@ def _words(certificate: Certificate, level: Level, objections: list[Objection]) 
     if level == "pass":
         return (
             f"The {count} periods lie in one frame, within 0.1 degrees and 0.2% of the scene's "
-            "extent of each other, according to matches that took no part in the estimation."
+            "extent of each other, according to matches or surfaces that took no part in the "
+            "estimation."
         )
     first = objections[0]
     start = (

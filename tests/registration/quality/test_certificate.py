@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.registration.generated import CaseSettings, generate_case, pose_errors
 from chronoscene.registration.quality import certificate as certificate_module
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
 from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
-from chronoscene.registration.quality.misalignment import Misalignment, Transfers
+from chronoscene.registration.quality.misalignment import Misalignment, Motion, Transfers
 from chronoscene.registration.quality.overlap import tie_spread
 from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position
 from chronoscene.registration.quality.rays import PlacedPoints, gather
@@ -361,6 +362,49 @@ def test_clouds_find_a_shift_without_matches(shift: tuple[float, float, float]) 
         assert found.beyond > 0.4
     else:
         assert found.beyond < 0.1
+
+
+def boxes(rng: np.random.Generator, noise: float) -> np.ndarray:
+    """Walls of 20 boxes on flat ground, with a dozen points each."""
+    middle = np.random.default_rng(7).uniform(-50, 50, (20, 2))
+    parts = [np.column_stack([rng.uniform(-60, 60, (900, 2)), np.zeros(900)])]
+    for axis in (0, 1):
+        for side in (-4.0, 4.0):
+            wall = np.add(rng.uniform(-4, 4, (20, 12, 3)), [0.0, 0.0, 4.0])
+            wall[:, :, axis] = side
+            wall[:, :, :2] += middle[:, None]
+            parts.append(wall.reshape(-1, 3))
+    every = np.concatenate(parts)
+    return every + rng.normal(0, noise, every.shape)
+
+
+def test_small_patches_measure_a_turn_that_wide_ones_leave_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Sixteen points that are near each other do not lie on one wall here; six often do."""
+    turn = Rotation.from_euler("z", 0.3, degrees=True)
+    still = Motion.none(np.zeros((1, 3)), np.full((1, 3), 40.0), np.full((1, 3), 40.0))
+
+    def turns() -> tuple[float, float]:
+        """Root mean square error of the turn, and its standard deviation, degrees."""
+        errors, deviations = [], []
+        for seed in range(5):
+            rng = np.random.default_rng(seed)
+            first, second = boxes(rng, 0.05), turn.apply(boxes(rng, 0.05))
+            found = surface_distance(
+                as_cloud(first), as_cloud(second), np.array([0.0, 0.0, 99.0]), 0.0, still
+            )
+            assert isinstance(found, SurfaceDistance) and found.motion is not None
+            errors.append(np.degrees(found.motion.step[5]) - 0.3)
+            deviations.append(np.degrees(np.sqrt(found.motion.covariance[5, 5])))
+        return float(np.sqrt(np.mean(np.square(errors)))), float(np.mean(deviations))
+
+    fine = turns()
+    monkeypatch.setattr("chronoscene.registration.quality.surface_distance.FINER", ())
+    wide = turns()
+    assert fine[0] < 0.1
+    assert fine[0] < 1.5 * fine[1]
+    assert fine[1] < wide[1] / 2
 
 
 def test_clouds_too_small_or_apart_say_so() -> None:

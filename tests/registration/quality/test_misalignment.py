@@ -11,16 +11,20 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.registration.generated import CaseSettings, Generated, generate_case, pose_errors
+from chronoscene.arrays import Ints
 from chronoscene.registration.quality.misalignment import (
     Motion,
+    _bread,
     _interval,
     _sandwich,
+    _usual,
     measure,
     rotation_angle,
     transfer_errors,
     transfers,
 )
 from chronoscene.registration.quality.rays import (
+    TrackRays,
     held_out_rays,
     model_rays,
     place,
@@ -197,19 +201,73 @@ def test_bounds_are_as_far_away_as_the_errors_are_large(exact: Generated) -> Non
     assert 0.5 < 1.96 * np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
+def observed(track: Ints, image: Ints) -> TrackRays:
+    """Rays of which only the groups count."""
+    return TrackRays(track, image, *(np.zeros(0),) * 3)
+
+
 def test_more_images_of_a_track_and_small_residuals_do_not_narrow_a_bound() -> None:
     rng, track = np.random.default_rng(0), np.arange(300)
     residual, jacobian = 2 * rng.normal(size=(300, 2)), rng.normal(size=(300, 2, 7))
     weight = np.ones(300)
-    once = _sandwich(track, residual, jacobian, weight)
-    ten_times = (np.repeat(x, 10, axis=0) for x in (track, residual, jacobian, weight))
-    np.testing.assert_allclose(_sandwich(*ten_times), once)
-    noise = np.linalg.inv(np.einsum("nki,nkj->ij", jacobian, jacobian))
+    normal = np.einsum("nki,nkj->ij", jacobian, jacobian)
+    once = _sandwich(observed(track, track), residual, jacobian, weight, normal)
+    repeated = (np.repeat(x, 10, axis=0) for x in (residual, jacobian, weight))
+    ten_times = _sandwich(observed(np.repeat(track, 10), np.arange(3000)), *repeated, 10 * normal)
+    np.testing.assert_allclose(ten_times, once)
     ratios = [
-        np.mean(np.diag(_sandwich(track, size * residual, jacobian, weight)) / np.diag(noise))
+        np.mean(
+            np.diag(_sandwich(observed(track, track), size * residual, jacobian, weight, normal))
+            / np.diag(np.linalg.inv(normal))
+        )
         for size in (1.0, 0.01)
     ]
     assert ratios == pytest.approx([4.0, 1.0], rel=0.15)
+
+
+def test_what_the_points_of_an_image_share_widens_a_bound() -> None:
+    """Ten images of 100 points each, with an error of each pose that is as large as the noise."""
+    rng, image = np.random.default_rng(0), np.repeat(np.arange(10), 100)
+    jacobian = np.repeat(rng.normal(size=(10, 2, 7)), 100, axis=0)
+    jacobian += 0.3 * rng.normal(size=jacobian.shape)
+    noise, weight = rng.normal(size=(1000, 2)), np.ones(1000)
+    normal = np.einsum("nki,nkj->ij", jacobian, jacobian)
+    rays = observed(np.arange(1000), image)
+    alone, shared = (
+        np.sqrt(np.mean(np.diag(_sandwich(rays, residual, jacobian, weight, normal))))
+        for residual in (noise, noise + rng.normal(size=(10, 2))[image])
+    )
+    assert shared > 3 * alone
+
+
+def test_residuals_that_weights_hold_back_pull_by_less_than_their_weight() -> None:
+    """The derivative of the sum that is zero at the estimate, by differences."""
+    rng = np.random.default_rng(0)
+    residual, jacobian = rng.normal(size=(50, 2)), rng.normal(size=(50, 2, 7))
+    variance = rng.uniform(0.5, 2, 50)
+
+    def pull(step: np.ndarray) -> np.ndarray:
+        moved = residual + jacobian @ step
+        weight = 1 / (variance + (moved**2).sum(axis=1) / 4)
+        return np.einsum("nki,n,nk->i", jacobian, weight, moved)
+
+    weight = 1 / (variance + (residual**2).sum(axis=1) / 4)
+    expected = [(pull(1e-5 * e) - pull(-1e-5 * e)) / 2e-5 for e in np.eye(7)]
+    np.testing.assert_allclose(_bread(residual, jacobian, weight), expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("tracks", "contradict"), [(12, False), (1000, True)])
+def test_few_tracks_contradict_only_by_far(tracks: int, contradict: bool) -> None:
+    still = Motion(np.zeros(7), np.eye(7), *(np.zeros(3),) * 3)
+    moved = replace(still, step=np.full(7, 2.5), freedom=tracks - 7)
+    assert (still.joined(moved) is None) == contradict
+
+
+def test_the_usual_error_is_that_without_gross_ones() -> None:
+    rng = np.random.default_rng(0)
+    errors = np.concatenate([rng.rayleigh(0.5, 4000), rng.uniform(2, 50, 3000)])
+    assert _usual(errors, 3.0) == pytest.approx(0.5 * np.sqrt(2 * np.log(2)), rel=0.05)
+    assert _usual(np.array([5.0]), 1.0) == 0.0
 
 
 def test_ends_of_intervals_are_percentiles_of_motions_drawn() -> None:
