@@ -369,11 +369,10 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
     yield from _alignment(certificate, pair, place)
     if not isinstance(pair.held_out, str) and pair.held_out.tracks >= MIN_TRACKS:
         held = pair.held_out
-        others = [*_check("agreeing", held.agreeing, place)]
-        others += _check("together", (1 - held.agreeing) * held.disagreement.step, place)
         # Surfaces that measure the alignment by themselves tell which of the matches are right.
-        refuted = _surfaces_fit(certificate, pair)
-        yield from others if not refuted else ()
+        if not _surfaces_fit(certificate, pair):
+            yield from _check("agreeing", held.agreeing, place)
+            yield from _check("together", (1 - held.agreeing) * held.disagreement.step, place)
         yield from _check("gathered", (1 - held.agreeing) * held.disagreement.images, place)
         yield from _check("excess", _excess(certificate, pair), place)
     if not _confirmed(certificate, pair):
