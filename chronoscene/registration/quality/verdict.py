@@ -382,21 +382,17 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
         if isinstance(found, Localisation) and found.images >= 3:
             yield from _check("localised", _localised(found, certificate), place)
     if isinstance(pair.surfaces, SurfaceDistance):
-        shift, moved = pair.surfaces.shift, 0.0
+        shift = pair.surfaces.shift
         if shift.low > 0:
-            moved = 100 * shift.value / certificate.extent
-        against = list(_check("clouds", moved, place))
-        yield from against or _contradiction(certificate, pair, place)
+            against = list(_check("clouds", 100 * shift.value / certificate.extent, place))
+            yield from against or _contradiction(pair, place)
         yield from _check("open", 100 * shift.high / certificate.extent, place)
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
-def _contradiction(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
-    """Judge surfaces that contradict the matches, and are shifted, or misaligned by themselves."""
-    assert isinstance(pair.surfaces, SurfaceDistance)
-    alone = _of_limits(certificate, pair.by_surfaces)
-    off = pair.surfaces.shift.low > 0 or any(x.low > 1 for x in alone)
-    if off and _contradicted(pair):
+def _contradiction(pair: PairFigures, place: str) -> Iterator[Objection]:
+    """Judge surfaces that are shifted by less than the limit, but against the matches."""
+    if _contradicted(pair):
         found = "the surfaces are shifted, and contradict the matches (Hotelling, 99 %)"
         yield Objection("doubtful", "clouds", place, found, THRESHOLDS["clouds"].why, _LOOK)
 

@@ -470,10 +470,9 @@ def test_shifted_surfaces_that_contradict_the_matches_are_a_doubt(tracks: str) -
     still = with_part(certificate, "surfaces", shift=Interval(0.07, 0.0, 0.2))
     still = with_pair(still, **{without: None})
     assert judge(still).level == "pass"
-    # By themselves, they may be beyond the limits nevertheless.
-    for low, level in ((0.0999, "pass"), (0.1001, "doubtful")):
-        alone = (Interval(0.01, 0.0, 0.02), Interval(0.12, low, 0.15))
-        assert judge(with_pair(still, by_surfaces=alone)).level == level
+    # A similarity alone is none: small patches of real surfaces are surer than they are right.
+    alone = (Interval(0.01, 0.0, 0.02), Interval(0.12, 0.1001, 0.15))
+    assert judge(with_pair(still, by_surfaces=alone)).level == "pass"
 
 
 def test_held_out_tracks_beyond_the_limit_fail_with_the_estimate_of_all_ties() -> None:
