@@ -472,7 +472,10 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
             one = min(one, pair.independent[i], key=lambda x: x.high)
         loose, estimate = one.high * factor, one.value * factor
         beyond = loose > limit and estimate > limit  # Nothing confirms what this contradicts
-        # Forward-facing cameras leave depths open, which errors of their poses bend.
+        # Forward-facing cameras leave depths open, which errors of their poses bend, those of the
+        # surfaces with them: without these, ties must end below the limit as well.
+        if certificate.facing:
+            high = max(high, MARGIN * every.high * factor)
         room = (ROOM if every.high * factor <= limit and not certificate.facing else MARGIN) * limit
         if high > room or beyond or (loose > 2 * limit and not confirmed):
             t = THRESHOLDS[key]

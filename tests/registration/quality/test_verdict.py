@@ -452,6 +452,11 @@ def test_forward_facing_captures_need_a_margin() -> None:
         verdict = judge(with_part(facing, "by_all", shift=Interval(0.04, 0.0, high)))
         assert verdict.level == level
     assert "expected at most 0.16" in verdict.objections[0].found
+    # Surfaces may narrow the interval, but not from beyond the limit.
+    narrow = (Interval(0.01, 0.0, 0.02), Interval(0.02, 0.0, 0.04))
+    for high, level in ((0.0999, "pass"), (0.1001, "doubtful")):
+        wide = with_part(facing, "by_all", shift=Interval(0.04, 0.0, high))
+        assert judge(with_pair(wide, by_ties_and_surfaces=narrow)).level == level
 
 
 @pytest.mark.parametrize("tracks", ["by_all", "misalignment"])
