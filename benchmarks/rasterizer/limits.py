@@ -1,4 +1,4 @@
-"""What the processor lets the CPU rasterizer do, and how near to that it is.
+"""Limits that the processor sets to the CPU rasterizer, and how near to them it is.
 
     python -m benchmarks.rasterizer.limits [--repeats 9]
 
@@ -52,12 +52,12 @@ Times = dict[str, float]
 
 
 class Work(NamedTuple):
-    """What an image has to do."""
+    """Amount of work in an image."""
 
     listed: int
     """Pairs of a Gaussian and a tile that it touches."""
     entries: int
-    """Those of which something is composited."""
+    """Pairs of which something is composited."""
     blocks: int
     """Blocks of 16 pixels of these."""
 

@@ -110,8 +110,7 @@ class PairFigures:
     by_ties_and_surfaces: tuple[Interval, Interval] | None = None
     """Rotation and displacement by `by_all` and the surfaces together."""
     independent: tuple[Interval, Interval] | None = None
-    """By held-out tracks and the surfaces together, or by the surfaces alone where held-out tracks
-    measure nothing."""
+    """By held-out tracks and the surfaces together."""
     by_surfaces: tuple[Interval, Interval] | None = None
     """By the surfaces alone."""
 
@@ -238,10 +237,8 @@ def _pair(
     misalignment: Misalignment | str = nothing
     if good.any():
         figures = _held_out(moved, good, (placed_a, placed_b), _epipolar(model, evidence, periods))
-        misalignment = (
-            measure(moved, placed_a, placed_b, centres)
-            or "held-out tracks are too few, or too close together"
-        )
+        measured = measure(moved, placed_a, placed_b, centres)
+        misalignment = measured or "held-out tracks are too few, or too close together"
     by_all = measure(*_all_transfers(model, evidence, a, b), centres)
     of_a, of_b = (evidence.ties.where(model.periods[evidence.ties.image] == p) for p in periods)
     sigma = by_all.shift.high / 1.96 if by_all is not None else 0.0
@@ -256,10 +253,9 @@ def _pair(
     by_surfaces = None
     if not isinstance(surfaces, str) and surfaces.motion is not None:
         by_surfaces = surfaces.motion.intervals()
-    measured = isinstance(misalignment, Misalignment)
     return PairFigures(
         by_ties_and_surfaces=_with_surfaces(by_all, surfaces),
-        independent=_with_surfaces(misalignment, surfaces) if measured else by_surfaces,
+        independent=_with_surfaces(misalignment, surfaces),
         by_surfaces=by_surfaces,
         a=a,
         b=b,

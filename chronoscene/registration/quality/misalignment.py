@@ -33,6 +33,8 @@ CORE = 0.25
 
 CONTRADICTS = 0.99  # Probability within which two estimates of seven parameters differ
 
+MANY = 1e9  # Degrees of freedom of a covariance that is known
+
 MAX_SEEN = 500  # Observations by which a change in depth is measured
 
 NOISE_FLOOR = 0.1  # Pixels: no feature is located better, even if a few residuals are smaller
@@ -103,7 +105,7 @@ class Motion:
     """Cameras whose displacement is measured. [C, 3]"""
     seen: Array
     """Points and the cameras that see them, whose depth is measured. [2, O, 3]"""
-    freedom: float = 1e9
+    freedom: float = MANY
     """Degrees of freedom of the covariance."""
 
     @classmethod
@@ -374,8 +376,8 @@ def _describe(
 ) -> Misalignment | None:
     residual, (jacobian, variance) = _residuals(moved, similarity, middle)
     weight, noise = _weights(residual, variance, core)
-    bread = _bread(residual, jacobian, weight)
-    covariance = _sandwich(moved.rays, residual, jacobian, weight, bread)
+    finite = np.nan_to_num(residual), np.nan_to_num(jacobian)
+    covariance = _sandwich(moved.rays, *finite, weight, _bread(*finite, weight))
     if covariance is None:
         return None
     some = slice(None, None, len(moved) // MAX_SEEN + 1)
@@ -425,7 +427,6 @@ def _bread(residual: Array, jacobian: Array, weight: Array) -> Array:
         jacobian: [O, 2, 7]
         weight: [O]
     """
-    residual, jacobian = np.nan_to_num(residual), np.nan_to_num(jacobian)
     normal, _ = _sum(residual, jacobian, weight)
     along = np.einsum("nki,nk->ni", jacobian, residual)
     curved = normal - np.einsum("ni,n,nj->ij", along, weight**2 / 2, along)
@@ -442,7 +443,6 @@ def _sandwich(
     """
     from scipy.linalg import eigh
 
-    residual, jacobian = np.nan_to_num(residual), np.nan_to_num(jacobian)
     score = np.einsum("nki,n,nk->ni", jacobian, weight, residual)
     sums, by_image = _grouped(score, rays.track), _grouped(score, rays.image)
     groups = len(sums)

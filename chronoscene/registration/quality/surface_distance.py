@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from chronoscene.arrays import Array, Mask
-from chronoscene.registration.quality.misalignment import Interval, Motion, generators
+from chronoscene.registration.quality.misalignment import MANY, Interval, Motion, generators
 from chronoscene.registration.quality.rays import PlacedPoints
 from chronoscene.scene.similarity import SIGMA
 
@@ -100,7 +100,7 @@ def _similarity(patches: _Patches, size: int, like: Motion) -> Motion:
     """Similarity that would bring the clouds together."""
     facing = np.einsum("ni,nij->nj", patches.normal, generators(patches.mean - like.middle))
     step, covariance = _solve(patches.distance, facing, patches.chance, size)
-    return replace(like, step=step, covariance=covariance, freedom=1e9)
+    return replace(like, step=step, covariance=covariance, freedom=MANY)
 
 
 def _uncertainty(motion: Motion) -> float:

@@ -468,14 +468,16 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
         if max(low, min(one.low, every.value)) * factor > limit:
             yield from _check(key, max(one.value, every.value) * factor, place)
             continue
-        if pair.independent is not None:
-            one = min(one, pair.independent[i], key=lambda x: x.high)
+        # Surfaces alone where held-out tracks measure nothing.
+        independent = pair.by_surfaces if isinstance(held, str) else pair.independent
+        if independent is not None:
+            one = min(one, independent[i], key=_high)
         loose, estimate = one.high * factor, one.value * factor
         beyond = loose > limit and estimate > limit  # Nothing confirms what this contradicts
         # Forward-facing cameras leave depths open, which errors of their poses bend, those of the
         # surfaces with them: without these, ties must end below the limit as well.
-        if certificate.facing:
-            high = max(high, MARGIN * every.high * factor)
+        if certificate.facing and every.high * factor > limit:
+            high = every.high * factor
         room = (ROOM if every.high * factor <= limit and not certificate.facing else MARGIN) * limit
         if high > room or beyond or (loose > 2 * limit and not confirmed):
             t = THRESHOLDS[key]

@@ -110,10 +110,7 @@ def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure
         yield from _misalignment_figures(certificate, name, found, unit)
     for name, both in (
         ("by surfaces", pair.by_surfaces),
-        (
-            "by held-out tracks and surfaces",
-            pair.independent if isinstance(pair.misalignment, Misalignment) else None,
-        ),
+        ("by held-out tracks and surfaces", pair.independent),
         ("by held-out tracks, ties and surfaces", pair.by_ties_and_surfaces),
     ):
         if both is not None:
