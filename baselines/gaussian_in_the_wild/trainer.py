@@ -17,8 +17,9 @@ from chronoscene.gaussians.trainer import Due, GaussianTrainer
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.training import devices
 from chronoscene.training.checkpoint import TrainingState
-from chronoscene.training.devices import to_device, uniform
+from chronoscene.training.devices import to_device
 from chronoscene.training.drawing import Splats
 from chronoscene.training.losses import steady_mean
 
@@ -31,11 +32,15 @@ comes back."""
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch on one thread: its products and convolutions round by how they share their work."""
+    """Torch on one thread, as its products and convolutions round by how they share their work.
+
+    On a GPU, convolutions keep all digits of float32, which torch by default lets them round off.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            yield
     finally:
         torch.set_num_threads(before)
 
@@ -67,7 +72,7 @@ class WildTrainer(GaussianTrainer):
         if self._visibility_counts():
             self._visible = see(stages, self.model.shared, view.height, view.width)
         generator = np.random.default_rng((self.seed, _STREAM, self.sampler.drawn))
-        kept = uniform(generator, tuple(dynamic.shape), dynamic) >= config.dropout
+        kept = devices.uniform(generator, tuple(dynamic.shape), dynamic) >= config.dropout
         return self.model.painted(view, rows, dynamic * kept / (1 - config.dropout))
 
     def loss(self, raster: Rasterization, number: int, mask: Tensor | None) -> Tensor:

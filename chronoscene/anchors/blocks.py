@@ -33,9 +33,9 @@ _LEAST_LOSS = 1e-4  # Photos that are black, and shown so, say nothing
 _FORGET = 0.9  # What counts of earlier views after a round
 
 
-def own_blocks(count: int, periods: int) -> Tensor:
+def own_blocks(count: int, periods: int, device: str | torch.device = "cpu") -> Tensor:
     """Return rows of blocks that are not shared, anchor by anchor. int64 [count, T]"""
-    return torch.arange(count * periods).view(count, periods)
+    return torch.arange(count * periods, device=device).view(count, periods)
 
 
 def leaders(block_rows: Tensor) -> Tensor:
@@ -90,7 +90,7 @@ def unpack_blocks(tensors: dict[str, Tensor], periods: int) -> dict[str, Tensor]
     anchors = tensors["anchors"]
     if "block_leaders" not in tensors:
         columns = periods if tensors["blocks"].shape[1] else 0
-        return tensors | {"block_rows": own_blocks(len(anchors), columns).to(anchors.device)}
+        return tensors | {"block_rows": own_blocks(len(anchors), columns, anchors.device)}
     first = tensors["block_leaders"].long()
     if not (first < periods).all() or not _leads(first).gather(1, first).all():
         raise CheckpointError(

@@ -67,7 +67,7 @@ def learn_directly(
         return None
     tensors = _trained(inputs)
     fixed = (inputs.anchors, inputs.period_weights, inputs.camera_centre)
-    job = Job((*fixed, inputs.visible, inputs.used_offsets, inputs.block_rows), tensors)
+    job = Job((*fixed, inputs.rows(), inputs.used_offsets, inputs.block_rows), tensors)
     outputs = job.forward(np.float32(0))
     splats = Splats(*outputs[2:7])
     if len(splats.means) < LANES:

@@ -217,13 +217,13 @@ class AnchorModel:
         return decode(self.decode_inputs(period_weights, centre, visible))
 
     def decode_active(
-        self, period_weights: Tensor, centre: Tensor, visible: Tensor
+        self, period_weights: Tensor, centre: Tensor, visible: Tensor | None
     ) -> tuple[Splats, Tensor]:
         """Return `decode` without Gaussians that are switched off, and the places of the others."""
         return decode_active(self.decode_inputs(period_weights, centre, visible))
 
     def decode_inputs(
-        self, period_weights: Tensor, centre: Tensor, visible: Tensor
+        self, period_weights: Tensor, centre: Tensor, visible: Tensor | None
     ) -> DecodeInputs:
         """Return what `decode` reads; arguments as `DecodeInputs`."""
         opacity, covariance, color = (self._kernel_head(name) for name in HEADS)

@@ -71,7 +71,7 @@ class AnchorOptimizer:
         model = self.model
         if model.layout.period_dim:
             blocks = model.block_rows[:, row].index_select(0, visible)
-            rows = own_blocks(len(visible), 1).to(blocks)
+            rows = own_blocks(len(visible), 1, visible.device)
         else:
             rows = model.block_rows[visible]
             blocks = rows.flatten()
@@ -160,7 +160,7 @@ class AnchorOptimizer:
             setattr(model, name, self.tables[name].extend(getattr(new, name)))
         if layout.period_dim:
             blocks = blocks.unflatten(1, (-1, layout.period_dim))  # [N, T, Fv]
-            rows = len(model.blocks) + own_blocks(*blocks.shape[:2]).to(model.device)
+            rows = len(model.blocks) + own_blocks(len(blocks), blocks.shape[1], model.device)
             model.blocks = self.tables["blocks"].extend(blocks.flatten(0, 1))
             model.block_rows = torch.cat([model.block_rows, rows])
         else:

@@ -25,7 +25,7 @@ from chronoscene.kernels.side_by_side import side_by_side
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.checkpoint import TrainingState, check_views, parts
-from chronoscene.training.devices import has_kernels, to_device
+from chronoscene.training.devices import has_kernels
 from chronoscene.training.drawing import camera_centre_tensor, draw_in_training, step_background
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import (
@@ -39,7 +39,7 @@ from chronoscene.training.losses import mean_volume, training_loss
 from chronoscene.training.optimizers.adam import Pace
 from chronoscene.training.optimizers.summing import Part
 from chronoscene.training.schedules import learning_rates
-from chronoscene.training.views import ViewSampler, count_views, views_of_step
+from chronoscene.training.views import PhotosOnDevice, ViewSampler, count_views, views_of_step
 
 Learned = tuple[BackwardPass, Tensor, Tensor, RasterInfo]
 """Outcome, places [L] and opacities [L] of the Gaussians that are switched on, and details of the
@@ -107,6 +107,7 @@ class AnchorTrainer:
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed, train.expect)
+        self.photos = PhotosOnDevice(train, model.device)
         self.exposure = Exposure(self.config.exposure, train, model.device, Pace(self.views))
 
     def step(self, index: int, progress: float) -> StepReport:
@@ -154,8 +155,9 @@ class AnchorTrainer:
     def _draw(self) -> Drawn:
         """Draw the next view and load its photo."""
         number, device = self.sampler.next(), self.model.device
-        photo = to_device(self.train.load_image(number), device)
-        return Drawn(number, self.sampler.drawn, photo, mask_tensor(self.train, number, device))
+        return Drawn(
+            number, self.sampler.drawn, self.photos[number], mask_tensor(self.train, number, device)
+        )
 
     def _learn(self, due: Drawn) -> ViewPass:
         """Draw a training view and collect gradients; the model and its optimiser stay."""
@@ -172,10 +174,11 @@ class AnchorTrainer:
         )
         return ViewPass(result, drawn, seen, self.exposure.parts())
 
-    def _decode_arguments(self, seen: AnchorModel, view: TrainingView) -> tuple[Tensor, ...]:
-        """Return period weights, camera centre and the numbers of all anchors."""
-        everything = torch.arange(len(seen), device=seen.device)
-        return self._one_period, camera_centre_tensor(view, seen.device), everything
+    def _decode_arguments(
+        self, seen: AnchorModel, view: TrainingView
+    ) -> tuple[Tensor, Tensor, None]:
+        """Return period weights and camera centre; all anchors are to be decoded."""
+        return self._one_period, camera_centre_tensor(view, seen.device), None
 
     def _learn_directly(self, seen: SeenAnchors, due: Drawn) -> Learned | None:
         """Learn from a view without autograd; None where that does not apply."""

@@ -16,6 +16,7 @@ from chronoscene.methods import View
 from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.constants import CLAMP_MARGIN, EPS2D, FAR_PLANE
 from chronoscene.training import devices
+from chronoscene.training.drawing import camera_numbers
 
 _EXTENT = 3.33
 """Half width of a footprint in standard deviations: where an opacity of 1 falls below 1/255."""
@@ -39,6 +40,8 @@ def visible_anchors(
     """
     anchors, log_scales = anchors.detach(), log_scales.detach()
     extent = _EXTENT if by == "radius" else 0.0
+    if devices.has_gpu_kernels(anchors, log_scales):
+        return _marked_on_gpu(anchors, log_scales, view, near_plane, extent).nonzero()[:, 0]
     if not devices.has_kernels(anchors, log_scales):
         return _marked(anchors, log_scales, view, near_plane, extent).nonzero()[:, 0]
     mask = np.empty(len(anchors), np.bool_)
@@ -83,6 +86,23 @@ def _marked(anchors: Tensor, log_scales: Tensor, view: View, near: float, extent
         place = focal * ratio + centre
         visible &= (place + radius > 0.0) & (place - radius < size)
     return visible
+
+
+def _marked_on_gpu(
+    anchors: Tensor, log_scales: Tensor, view: View, near: float, extent: float
+) -> Tensor:
+    from chronoscene.anchors import visibility_gpu
+
+    return visibility_gpu.marked(
+        anchors,
+        log_scales,
+        camera_numbers(view, anchors.device),
+        size=(view.width, view.height),
+        depths=(near, FAR_PLANE),
+        extent=extent,
+        blur=EPS2D,
+        slack=_SLACK,
+    )
 
 
 @inner

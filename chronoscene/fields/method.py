@@ -25,6 +25,7 @@ from chronoscene.fields.occupancy import INTERVAL, Occupancy, start_occupancy
 from chronoscene.fields.rays import PixelPool, Rays, view_rays
 from chronoscene.fields.rows import part_rows
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
+from chronoscene.training import devices
 from chronoscene.training.checkpoint import (
     TRAINING,
     check_finite,
@@ -33,7 +34,7 @@ from chronoscene.training.checkpoint import (
     parts,
     save_tensors,
 )
-from chronoscene.training.devices import to_device, uniform
+from chronoscene.training.devices import to_device
 from chronoscene.training.optimizers.adam import Adam, all_finite
 from chronoscene.training.periods import period_weights
 
@@ -160,7 +161,7 @@ class FieldMethod(ABC):
         if len(self.pool) == 0:
             return StepReport(0.0, count, "empty")
         rays = self.draw_rays(generator)
-        jitter = uniform(generator, (len(rays.views),), rays.depths)
+        jitter = devices.uniform(generator, (len(rays.views),), rays.depths)
         samples = self.march(rays, self.pool.periods[rays.views], jitter)
         if len(samples.lengths) == 0:
             return StepReport(0.0, count, "empty")

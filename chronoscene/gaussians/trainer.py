@@ -25,7 +25,6 @@ from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import TrainingState, check_views, parts
-from chronoscene.training.devices import to_device
 from chronoscene.training.drawing import Splats, draw_in_training
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import BackwardPass, collect_gradients, joined, mask_tensor
@@ -34,7 +33,13 @@ from chronoscene.training.optimizers.adam import Adam, Pace
 from chronoscene.training.optimizers.summing import Part, add_gradients
 from chronoscene.training.photometric import photometric_loss
 from chronoscene.training.schedules import cooled, log_linear
-from chronoscene.training.views import ViewSampler, count_views, is_due, views_of_step
+from chronoscene.training.views import (
+    PhotosOnDevice,
+    ViewSampler,
+    count_views,
+    is_due,
+    views_of_step,
+)
 
 # Keep random choices of a kind apart from those of others with the same seed
 _SPLIT_STREAM = 1
@@ -132,6 +137,7 @@ class GaussianTrainer:
         """Begin with the views of the training set, and without exposures."""
         device = self.background.device
         self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
+        self.photos = PhotosOnDevice(self.train, device)
         self.exposure = Exposure(self.config.exposure, self.train, device, self.pace)
 
     def begin(self) -> None:
@@ -235,11 +241,9 @@ class GaussianTrainer:
 
     def loss(self, raster: Rasterization, number: int, mask: Tensor | None) -> Tensor:
         """Photometric loss against the photo of view ``number``; methods may add terms."""
-        # A copy, as cached images are not ours to write to, which torch cannot promise.
-        photo = to_device(self.train.load_image(number).copy(), raster.image.device)
         return training_loss(
             raster,
-            photo,
+            self.photos[number],
             mask,
             number=number,
             exposure=self.exposure,

@@ -18,7 +18,7 @@ from chronoscene.scene.similarity import Sim3
 Skipped = Literal["empty", "not finite"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class View:
     """A pinhole camera to render: intrinsics in pixels, pose in the training frame."""
 

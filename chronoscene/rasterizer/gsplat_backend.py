@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from chronoscene.errors import BackendError
-from chronoscene.kernels.runtime import gsplat_release
+from chronoscene.kernels.runtime import HAS_TRITON, gsplat_release
 from chronoscene.rasterizer import RasterInfo, Rasterization, reference
 from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
 from chronoscene.rasterizer.inputs import Inputs, recentred
@@ -33,7 +33,9 @@ _TOOLKIT = (
 def rasterize(inputs: Inputs) -> Rasterization:
     """Render Gaussians. Everything is cast to float32."""
     gsplat = _load(inputs.means.device)
-    means, viewmats = recentred(inputs.means, inputs.viewmats)
+    means, viewmats = inputs.means, inputs.viewmats
+    if not means.dtype == viewmats.dtype == torch.float32:  # else there are no digits to lose
+        means, viewmats = recentred(means, viewmats)
     inputs = replace(
         inputs,
         means=means.float(),
@@ -135,6 +137,11 @@ def _first_error(output: str) -> str:
 
 def _without_bad_rows(*arrays: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
     """Gaussians with nan, without a rotation or too faint to see, made invisible and harmless."""
+    if HAS_TRITON and arrays[0].is_cuda:
+        from chronoscene.rasterizer.clean_gpu import cleaned
+
+        made, good = cleaned(arrays, least_length=QUATERNION_MIN, least_opacity=ALPHA_MIN)
+        return tuple(made), good
     means, quats, scales, opacities, colors = arrays
     finite = torch.stack([torch.isfinite(x.reshape(len(x), -1)).all(-1) for x in arrays]).all(0)
     good = finite & (quats.abs().amax(-1) >= QUATERNION_MIN) & (opacities > ALPHA_MIN)

@@ -1,4 +1,4 @@
-"""Devices: compiled kernels on a CPU, plain torch on a GPU, for which the host need not wait.
+"""Devices: compiled kernels on a CPU; on a GPU, for which the host need not wait, torch and Triton.
 
 A copy from the host's ordinary memory, and every question to a tensor that Python wants to know
 the answer of, makes the host wait until a GPU has done all that it was asked for before.
@@ -11,10 +11,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from chronoscene.kernels.runtime import HAS_TRITON
+
 
 def has_kernels(*tensors: Tensor) -> bool:
     """Return True if compiled kernels can work on tensors: float32 on a CPU."""
     return all(t.is_cpu and t.dtype is torch.float32 for t in tensors)
+
+
+def has_gpu_kernels(*tensors: Tensor) -> bool:
+    """Return True if our kernels for a GPU can work on tensors: float32 there, and Triton."""
+    return HAS_TRITON and all(t.is_cuda and t.dtype is torch.float32 for t in tensors)
 
 
 def to_device(array: NDArray[np.generic], device: str | torch.device) -> Tensor:

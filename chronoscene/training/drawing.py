@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.methods import Prediction, View
@@ -149,12 +152,42 @@ def camera_tensors(view: View, device: str | torch.device = "cpu") -> tuple[Tens
         viewmats: Pose in the training frame. float32 [1, 4, 4]
         Ks: Intrinsics in pixels. float32 [1, 3, 3]
     """
-    viewmats = np.array(view.cam_from_world, dtype=np.float32)[None]
-    Ks = np.array(view.K, dtype=np.float32)[None]
-    return to_device(viewmats, device), to_device(Ks, device)
+    pose = _of_view(view, device, "pose", lambda: np.array(view.cam_from_world, np.float32)[None])
+    return pose, _of_view(view, device, "K", lambda: np.array(view.K, np.float32)[None])
 
 
 def camera_centre_tensor(view: View, device: str | torch.device = "cpu") -> Tensor:
     """Compute the camera centre in the training frame, in float64. float32 [3]"""
-    centre = camera_centre(np.asarray(view.cam_from_world, dtype=np.float64))
-    return to_device(centre.astype(np.float32), device)
+
+    def centre() -> NDArray[np.float32]:
+        pose = np.asarray(view.cam_from_world, dtype=np.float64)
+        return camera_centre(pose).astype(np.float32)
+
+    return _of_view(view, device, "centre", centre)
+
+
+def camera_numbers(view: View, device: str | torch.device) -> Tensor:
+    """Return the first three rows of the pose of a view, then fx, fy, cx and cy. float64 [16]"""
+
+    def numbers() -> NDArray[np.float64]:
+        inner = [view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]]
+        return np.concatenate([np.ravel(view.cam_from_world[:3]), inner]).astype(np.float64)
+
+    return _of_view(view, device, "numbers", numbers)
+
+
+_ON_GPU: WeakKeyDictionary[View, dict[tuple[str, torch.device], Tensor]] = WeakKeyDictionary()
+"""Tensors of views, as a copy of a few numbers takes as long as one of many."""
+
+
+def _of_view(
+    view: View, device: str | torch.device, name: str, make: Callable[[], NDArray[np.generic]]
+) -> Tensor:
+    """Return a tensor of an array of a view, which a GPU gets once."""
+    device = torch.device(device)
+    if device.type == "cpu":
+        return torch.from_numpy(make())
+    kept, key = _ON_GPU.setdefault(view, {}), (name, device)
+    if key not in kept:
+        kept[key] = to_device(make(), device)
+    return kept[key]

@@ -7,14 +7,20 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from chronoscene.kernels.thread_pool import num_workers
-from chronoscene.methods import TrainingView
+from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.methods.interface import nothing_ahead
+from chronoscene.training.devices import to_device
 
 MOST_VIEWS = 4
 """Views of a step with ``views_per_step=auto``, at most."""
+
+SHARE_OF_GPU = 0.25
+"""Of the memory that a GPU has free at the start, for photos at most."""
 
 AHEAD = 32
 """Number of draws that are known before they are made."""
@@ -61,6 +67,32 @@ class ViewSampler:
             self._pools.pop(pool - 2, None)  # Draws that are known at one time are of two pools
             self._pools[pool] = generator.permutation(self.count)
         return int(self._pools[pool][position])
+
+
+class PhotosOnDevice:
+    """Photos of a training set as tensors on a device; a GPU keeps those for which it has room.
+
+    Args:
+        train: The training set.
+        device: Of the tensors.
+    """
+
+    def __init__(self, train: TrainingSet, device: torch.device) -> None:
+        self._train, self._device = train, device
+        self._kept: dict[int, Tensor] = {}
+        self._room = 0
+        if device.type == "cuda":
+            self._room = int(SHARE_OF_GPU * torch.cuda.mem_get_info(device)[0])
+
+    def __getitem__(self, number: int) -> Tensor:
+        """Return the photo of a view. uint8 [H, W, 3]"""
+        if number in self._kept:
+            return self._kept[number]
+        photo = to_device(self._train.load_image(number), self._device)
+        if photo.nbytes <= self._room:
+            self._kept[number] = photo
+            self._room -= photo.nbytes
+        return photo
 
 
 def count_views(option: int | Literal["auto"]) -> int:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +113,8 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     """A GPU, or a CPU that runs what a GPU would."""
     if request.param == "cpu":
         without_kernels(monkeypatch)
+    else:
+        draw_on_the_host(monkeypatch)
     return request.param
 
 
@@ -144,6 +148,17 @@ def training(compiled: Compiled, device: str, tmp_path_factory: pytest.TempPathF
             reports.append(method.step(i, i / tiny_training.STEPS))
         compiled.trainings[device] = Training(method, reports, saved)
     return compiled.trainings[device]
+
+
+def draw_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give a GPU the random numbers of a CPU, by which fields choose their rays."""
+
+    def from_host(draw: Callable[..., torch.Tensor], *args: Any) -> torch.Tensor:
+        *rest, like = args
+        return draw(*rest, torch.empty(0)).to(like.device)
+
+    for name in ("uniform", "integers", "normal"):
+        monkeypatch.setattr(devices, name, partial(from_host, getattr(devices, name)))
 
 
 def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:

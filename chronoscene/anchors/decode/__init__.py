@@ -1,7 +1,8 @@
 """Decode anchors into Gaussians: the small MLPs of Scaffold-GS and ChronoGS.
 
 `decode_reference` is the definition, in plain torch; `decode` is its compiled form: `function`
-joins it to torch, `forward` and `backward` are the kernels, on memory that `layout` describes.
+joins it to torch, `forward` and `backward` are the kernels, on memory that `layout` describes;
+`gpu` is what a GPU runs.
 
 Source: Scaffold-GS (Lu et al., CVPR 2024), section 3.2, and ChronoGS (arXiv 2511.18794), section 3,
 which adds the features that vary with the period.
@@ -66,13 +67,19 @@ class DecodeInputs(NamedTuple):
     """3 k outputs: rgb per offset."""
     camera_centre: Tensor
     """In the training frame; gets no gradient. [3]"""
-    visible: Tensor
-    """Ascending indices of the anchors to decode. int64 [M]"""
+    visible: Tensor | None
+    """Ascending indices of the anchors to decode; None for all. int64 [M]"""
     used_offsets: Tensor
     """Bit j says whether an anchor uses its offset j; what it does not has opacity -1. int64 [A]"""
     block_rows: Tensor
     """Block of an anchor at a period; no two anchors share one. int64 [A, T], or [A, 0] where
     blocks have no numbers."""
+
+    def rows(self) -> Tensor:
+        """Return the indices of the anchors to decode. int64 [M]"""
+        if self.visible is not None:
+            return self.visible
+        return torch.arange(len(self.anchors), device=self.anchors.device)
 
     @property
     def heads(self) -> tuple[HeadWeights, HeadWeights, HeadWeights]:
@@ -105,27 +112,28 @@ def decode_reference(x: DecodeInputs) -> Splats:
         splats: k to each visible anchor, anchor by anchor; opacities -1..1, colours 0..1. [M * k]
     """
     num_offsets = x.opacity_head.w2.shape[0]
-    # Not x.features[x.visible], whose gradient would be sorted by rows.
-    rows = x.block_rows.index_select(0, x.visible).flatten()
-    shape = (len(x.visible), x.block_rows.shape[1], x.blocks.shape[1])
+    visible = x.rows()
+    # Not x.features[visible], whose gradient would be sorted by rows.
+    rows = x.block_rows.index_select(0, visible).flatten()
+    shape = (len(visible), x.block_rows.shape[1], x.blocks.shape[1])
     blocks = x.blocks.index_select(0, rows).view(shape)
-    centres = x.anchors.index_select(0, x.visible).detach()
+    centres = x.anchors.index_select(0, visible).detach()
     directions = centres - x.camera_centre.detach()
     lengths = directions.norm(dim=-1, keepdim=True)
     directions = torch.where(lengths > MIN_DISTANCE, directions / lengths, 0)
     inputs = torch.cat(
         (
-            x.features.index_select(0, x.visible),
+            x.features.index_select(0, visible),
             torch.einsum("t,mtv->mv", x.period_weights[: blocks.shape[1]], blocks),
             directions,
-            (x.period_weights @ x.global_features).expand(len(x.visible), -1),
+            (x.period_weights @ x.global_features).expand(len(visible), -1),
         ),
         dim=-1,
     )
-    factors = torch.exp(x.log_scales.index_select(0, x.visible))[:, None, :]
-    offsets = x.offsets.index_select(0, x.visible)
+    factors = torch.exp(x.log_scales.index_select(0, visible))[:, None, :]
+    offsets = x.offsets.index_select(0, visible)
     covariances = mlp(inputs, x.covariance_head).reshape(-1, num_offsets, 7)
-    used = unpack_bits(x.used_offsets.index_select(0, x.visible), num_offsets)
+    used = unpack_bits(x.used_offsets.index_select(0, visible), num_offsets)
     opacities = torch.where(used, torch.tanh(mlp(inputs, x.opacity_head)), -1)
     return Splats(
         means=(centres[:, None] + offsets * factors[..., :3]).reshape(-1, 3),
@@ -141,7 +149,7 @@ def decode(x: DecodeInputs) -> Splats:
 
     Only rows of visible anchors are read. Gradients of per-anchor tensors are dense, zero in other
     rows and in the blocks of periods of weight 0. Values and gradients have equal bits for any
-    number of threads. Other types and devices go through `decode_reference`.
+    number of threads. A GPU has kernels of its own; other types go through `decode_reference`.
 
     Raises:
         ShapeError: If the sizes do not fit together.
@@ -163,17 +171,23 @@ def decode_active(x: DecodeInputs) -> tuple[Splats, Tensor]:
 
 def _decode(x: DecodeInputs, above: np.float32) -> tuple[Splats, Tensor]:
     _check(x)
-    fixed = (
-        x.anchors, x.period_weights, x.camera_centre, x.visible, x.used_offsets, x.block_rows
-    )  # fmt: skip
     tensors = (x.offsets, x.features, x.blocks, x.log_scales, x.global_features)
     weights = [weight for head in x.heads for weight in head]
-    floats = (*fixed[:3], *tensors, *weights)
+    floats = (x.anchors, x.period_weights, x.camera_centre, *tensors, *weights)
     if devices.has_kernels(*floats):
-        _check_visible(x.visible, len(x.anchors))
+        visible = x.rows()
+        _check_visible(visible, len(x.anchors))
         _check_block_rows(x.block_rows, len(x.blocks))
+        fixed = (
+            x.anchors, x.period_weights, x.camera_centre, visible, x.used_offsets, x.block_rows
+        )  # fmt: skip
         *outputs, index = Decode.apply(above, fixed, *tensors, *weights)
         return Splats(*outputs), index
+    if devices.has_gpu_kernels(*floats):
+        from chronoscene.anchors.decode import gpu
+
+        found, index = gpu.decode(x, float(above))
+        return Splats(*found), index
     splats = decode_reference(x)
     index = (~(splats.opacities <= float(above))).nonzero()[:, 0]
     return Splats(*(value.index_select(0, index) for value in splats)), index
@@ -191,7 +205,8 @@ def _check(x: DecodeInputs) -> None:
     check_shape("log_scales", x.log_scales, (rows, 6))
     check_shape("global_features", x.global_features, (periods, None))
     check_shape("camera_centre", x.camera_centre, (3,))
-    check_shape("visible", x.visible, (None,))
+    if x.visible is not None:
+        check_shape("visible", x.visible, (None,))
     check_shape("used_offsets", x.used_offsets, (rows,))
     inputs = x.features.shape[1] + x.blocks.shape[1] + 3 + x.global_features.shape[1]
     names = ("opacity", "covariance", "color")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -206,12 +208,15 @@ class Adam:
 @torch.no_grad()
 def apply_updates(updates: Iterable[Update]) -> None:
     """Do updates, of any number of tensors in one compiled call."""
-    compiled = []
+    compiled, on_gpu = [], []
     for update in updates:
         if devices.has_kernels(update.value):
             compiled.append(update._replace(grad=update.grad.contiguous()))
+        elif update.value.is_cuda and update.value.dtype is torch.float32:
+            on_gpu.append(update)
         else:
             _step_torch(*update)
+    step_fused(on_gpu)
     if not compiled:
         return
     addresses = np.array(
@@ -225,6 +230,43 @@ def apply_updates(updates: Iterable[Update]) -> None:
     # Starting the threads costs more than a small update.
     run = adam_tensors if sizes.max() > BLOCK else adam_tensors_alone
     run(addresses, _block_starts(sizes), sizes, scalars)
+
+
+def step_fused(updates: Iterable[Update]) -> None:
+    """Do updates of float32 tensors by torch's fused Adam, one call for each learning rate.
+
+    It knows the corrections of the bias from the number of the step. Ours are in the rate, and the
+    step is one after which there is nothing to correct.
+    """
+    groups = defaultdict[tuple[float, ...], list[Update]](list)
+    for update in updates:
+        if update.value.numel():
+            rate, root, pace = update.rate, update.root, update.pace
+            numbers = (rate / root, EPS / root, pace.beta1, pace.beta2)
+            groups[numbers].append(update)
+    for (rate, eps, beta1, beta2), group in groups.items():
+        values, grads, moments, *_ = zip(*group, strict=True)
+        torch._fused_adam_(
+            values,
+            [grad.contiguous() for grad in grads],
+            [m.mean for m in moments],
+            [m.square for m in moments],
+            [],
+            [_endless(values[0].device)] * len(group),
+            lr=rate,
+            beta1=beta1,
+            beta2=beta2,
+            weight_decay=0.0,
+            eps=eps,
+            amsgrad=False,
+            maximize=False,
+        )
+
+
+@cache
+def _endless(device: torch.device) -> Tensor:
+    """Number of a step so late that no moment has a bias."""
+    return torch.tensor(1e9, device=device)
 
 
 def _block_starts(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -314,7 +356,7 @@ def all_finite(tensors: Sequence[Tensor]) -> Tensor:
         return torch.tensor(True)
     if not devices.has_kernels(*tensors):
         # The largest magnitude is nan if any number is.
-        return torch.stack([tensor.abs().amax() for tensor in tensors]).isfinite().all()
+        return torch.nn.utils.get_total_norm(tensors, norm_type=math.inf).isfinite()
     tensors = [tensor.contiguous() for tensor in tensors]
     sizes = np.array([tensor.numel() for tensor in tensors])
     starts = _block_starts(sizes)

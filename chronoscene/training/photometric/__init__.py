@@ -1,4 +1,6 @@
-"""The photometric loss between a rendered image and a photo: compiled, and in plain torch."""
+"""The photometric loss between a rendered image and a photo: compiled for both kinds of devices,
+and in plain torch.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,9 @@ def photometric_loss(
         loss = (1 - w) mean|I - T| + w (1 - SSIM(I, T))
 
     SSIM has an 11x11 Gaussian window of sigma 1.5, zero padding, constants 0.01² and 0.03², and is
-    the mean over pixels and channels. In float32, value and gradient come from one pass: compiled
-    on a CPU, with equal bits for any number of threads; in plain torch on a GPU. Other types go
-    through `photometric_loss_reference`.
+    the mean over pixels and channels. In float32, value and gradient come from one pass: compiled,
+    and on a CPU with equal bits for any number of threads. Other types go through
+    `photometric_loss_reference`.
 
     Args:
         image: 0..1. float32 [H, W, 3]
@@ -113,6 +115,10 @@ def _loss_and_gradient(
 ) -> tuple[Tensor, Tensor]:
     count = image.numel()
     weights = ((1 - ssim_weight) / count, ssim_weight / count)
+    if devices.has_gpu_kernels(image):
+        from chronoscene.training.photometric import ssim_gpu
+
+        return ssim_gpu.l1_ssim(image.detach(), target, weights)
     if not devices.has_kernels(image):
         return ssim_torch.l1_ssim(image, _unit_range(target), weights)
     gradient = torch.empty(image.shape if wants_gradient else (0, *image.shape[1:]))
