@@ -32,7 +32,7 @@ def visible_anchors(
 
     Args:
         anchors: Positions in the training frame. [A, 3]
-        log_scales: Columns 0..2 are the logarithm of the anchor's extent. [A, 6]
+        log_scales: Columns 0..2 are the logarithm of the anchor's extent. [A, 3 or more]
         view: The camera.
         by: ``radius``: the projected footprint touches the image; ``frustum``: the centre
             projects into it.

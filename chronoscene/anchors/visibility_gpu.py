@@ -25,7 +25,7 @@ def marked(
 
     Args:
         anchors: Positions. float32 [A, 3]
-        log_scales: Columns 0..2 are the logarithm of the anchor's extent. float32 [A, 6]
+        log_scales: Columns 0..2 are the logarithm of the anchor's extent. float32 [A, 3 or more]
         camera: The first three rows of the pose, then fx, fy, cx, cy. float64 [16]
         size: Width and height in pixels.
         depths: Of the nearest and the farthest anchor.
@@ -37,7 +37,7 @@ def marked(
     if len(anchors):
         _mark[(triton.cdiv(len(anchors), BLOCK),)](
             anchors.contiguous(), log_scales.contiguous(), camera, mask, len(anchors),
-            *map(float, size), *depths, extent, blur, slack, BLOCK=BLOCK,
+            *map(float, size), *depths, extent, blur, slack, COLUMNS=log_scales.shape[1], BLOCK=BLOCK,
         )  # fmt: skip
     return mask
 
@@ -45,7 +45,7 @@ def marked(
 @triton.jit
 def _mark(  # type: ignore[no-untyped-def]
     anchors, log_scales, camera, mask, count, width, height, near, far, extent, blur, slack,
-    BLOCK: tl.constexpr,
+    COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < count
@@ -63,7 +63,8 @@ def _mark(  # type: ignore[no-untyped-def]
         slope = tl.minimum(tl.maximum(ratio, low), high)
         variance = tl.zeros([BLOCK], tl.float64) + blur
         for c in tl.static_range(3):
-            spread = tl.exp(2 * tl.load(log_scales + 6 * i + c, mask=inside, other=0.0))
+            size_log = tl.load(log_scales + COLUMNS * i + c, mask=inside, other=0.0)
+            spread = tl.exp(2 * size_log.to(tl.float64))
             own, along = tl.load(camera + 4 * axis + c), tl.load(camera + 8 + c)
             change = focal / z * (own - slope * along)
             variance += spread * change * change

@@ -13,11 +13,12 @@ pytestmark = MARKS
 
 
 @pytest.mark.parametrize("extent", [0.0, 3.33])
-def test_the_same_anchors_are_visible(extent: float) -> None:
+@pytest.mark.parametrize("columns", [3, 6])
+def test_the_same_anchors_are_visible(extent: float, columns: int) -> None:
     generator = np.random.default_rng(0)
     anchors = torch.from_numpy(generator.normal(0, 2, (3000, 3)).astype(np.float32))
-    log_scales = torch.from_numpy(generator.normal(-3, 1, (3000, 6)).astype(np.float32))
-    anchors[7], log_scales[9] = torch.nan, torch.inf
+    log_scales = torch.from_numpy(generator.normal(-3, 1, (3000, columns)).astype(np.float32))
+    anchors[7], log_scales[9], log_scales[11] = torch.nan, torch.inf, 100.0
     pose = np.eye(4)
     pose[:3, :3] = np.linalg.qr(generator.normal(size=(3, 3)))[0]
     pose[2, 3] = 1.0

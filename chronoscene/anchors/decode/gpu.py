@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 BLOCK = 256
 """Gaussians to a program."""
-ANCHORS = 64
-"""Anchors to a program of the backward pass."""
 _MIN_SQUARE = tl.constexpr(MIN_QUAT_NORM**2)
 
 
@@ -103,7 +101,7 @@ class _Splats(torch.autograd.Function):
         if active:
             read = anchors, offsets, log_scales, alphas, covariances, colors
             _place[grid](*read, flags, ends, *out, index, count, K=k, BLOCK=BLOCK)
-        ctx.save_for_backward(flags, ends, covariances, offsets, log_scales, *out[2:])
+        ctx.save_for_backward(flags, ends, covariances, offsets, log_scales, out[2], out[4])
         ctx.mark_non_differentiable(index)
         return (*out, index)
 
@@ -117,9 +115,12 @@ class _Splats(torch.autograd.Function):
             torch.empty_like(log_scales),
         ]  # fmt: skip
         if count:
-            _learn[(triton.cdiv(count, ANCHORS),)](
+            width = triton.next_power_of_2(k)
+            anchors = max(BLOCK // width, 1)
+            _learn[(triton.cdiv(count, anchors),)](
                 flags, ends, covariances, offsets, log_scales, *seen,
-                *(grad.contiguous() for grad in grads[:5]), *made, count, K=k, BLOCK=ANCHORS,
+                *(grad.contiguous() for grad in grads[:5]), *made,
+                count, K=k, WIDTH=width, BLOCK=anchors,
             )  # fmt: skip
         return None, None, None, *made
 
@@ -179,50 +180,43 @@ def _place(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _learn(  # type: ignore[no-untyped-def]
-    flags, ends, covariances, offsets, log_scales, scales, opacities, rgb,
+    flags, ends, covariances, offsets, log_scales, scales, rgb,
     d_means, d_quats, d_scales, d_opacities, d_rgb,
     to_opacities, to_covariances, to_colors, to_offsets, to_log_scales,
-    count, K: tl.constexpr, BLOCK: tl.constexpr,
+    count, K: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Take the gradients of the Gaussians of some anchors back; zeros for what is not marked."""
     m = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    inside = m < count
+    j = tl.arange(0, WIDTH)
+    at = m[:, None] * K + j[None, :]
+    anchor, inside = m < count, (m[:, None] < count) & (j[None, :] < K)
+    on = tl.load(flags + at, mask=inside, other=0) != 0
+    row = tl.load(ends + at, mask=on, other=1).to(tl.int64) - 1
+    tl.store(to_opacities + at, tl.load(d_opacities + row, mask=on, other=0.0), mask=inside)
     for c in tl.static_range(3):
-        reach = tl.exp(tl.load(log_scales + 6 * m + c, mask=inside, other=0.0))
-        of_reach = tl.zeros([BLOCK], tl.float32)
-        of_size = tl.zeros([BLOCK], tl.float32)
-        for j in range(K):
-            at = m * K + j
-            on = tl.load(flags + at, mask=inside, other=0) != 0
-            row = 3 * (tl.load(ends + at, mask=on, other=1).to(tl.int64) - 1) + c
-            d_mean = tl.load(d_means + row, mask=on, other=0.0)
-            of_reach += d_mean * tl.load(offsets + 3 * at + c, mask=on, other=0.0) * reach
-            tl.store(to_offsets + 3 * at + c, d_mean * reach, mask=inside)
-            moved = tl.load(d_scales + row, mask=on, other=0.0)
-            moved = moved * tl.load(scales + row, mask=on, other=0.0)
-            of_size += moved
-            share = _sigmoid(tl.load(covariances + 7 * at + c, mask=on, other=0.0))
-            tl.store(to_covariances + 7 * at + c, moved * (1 - share), mask=inside)
-            y = tl.load(rgb + row, mask=on, other=0.0)
-            d_color = tl.load(d_rgb + row, mask=on, other=0.0) * y * (1 - y)
-            tl.store(to_colors + 3 * at + c, d_color, mask=inside)
-        tl.store(to_log_scales + 6 * m + c, of_reach, mask=inside)
-        tl.store(to_log_scales + 6 * m + 3 + c, of_size, mask=inside)
-    for j in range(K):
-        at = m * K + j
-        on = tl.load(flags + at, mask=inside, other=0) != 0
-        row = tl.load(ends + at, mask=on, other=1).to(tl.int64) - 1
-        tl.store(to_opacities + at, tl.load(d_opacities + row, mask=on, other=0.0), mask=inside)
-        square = tl.zeros([BLOCK], tl.float32)
-        along = tl.zeros([BLOCK], tl.float32)
-        for c in tl.static_range(4):
-            q = tl.load(covariances + 7 * at + 3 + c, mask=on, other=0.0)
-            square += q * q
-            along += q * tl.load(d_quats + 4 * row + c, mask=on, other=0.0)
-        valid = square > _MIN_SQUARE
-        inverse = tl.where(valid, tl.rsqrt(tl.where(valid, square, 1.0)), 0.0)
-        for c in tl.static_range(4):
-            q = tl.load(covariances + 7 * at + 3 + c, mask=on, other=0.0)
-            d_quat = tl.load(d_quats + 4 * row + c, mask=on, other=0.0)
-            d_q = inverse * (d_quat - q * along * inverse * inverse)
-            tl.store(to_covariances + 7 * at + 3 + c, d_q, mask=inside)
+        reach = tl.exp(tl.load(log_scales + 6 * m + c, mask=anchor, other=0.0))[:, None]
+        moved = tl.load(d_means + 3 * row + c, mask=on, other=0.0) * reach
+        tl.store(to_offsets + 3 * at + c, moved, mask=inside)
+        moved = moved * tl.load(offsets + 3 * at + c, mask=on, other=0.0)
+        tl.store(to_log_scales + 6 * m + c, tl.sum(moved, axis=1), mask=anchor)
+        grown = tl.load(d_scales + 3 * row + c, mask=on, other=0.0)
+        grown = grown * tl.load(scales + 3 * row + c, mask=on, other=0.0)
+        tl.store(to_log_scales + 6 * m + 3 + c, tl.sum(grown, axis=1), mask=anchor)
+        share = _sigmoid(tl.load(covariances + 7 * at + c, mask=on, other=0.0))
+        tl.store(to_covariances + 7 * at + c, grown * (1 - share), mask=inside)
+        y = tl.load(rgb + 3 * row + c, mask=on, other=0.0)
+        d_color = tl.load(d_rgb + 3 * row + c, mask=on, other=0.0) * y * (1 - y)
+        tl.store(to_colors + 3 * at + c, d_color, mask=inside)
+    square = tl.zeros([BLOCK, WIDTH], tl.float32)
+    along = tl.zeros([BLOCK, WIDTH], tl.float32)
+    for c in tl.static_range(4):
+        q = tl.load(covariances + 7 * at + 3 + c, mask=on, other=0.0)
+        square += q * q
+        along += q * tl.load(d_quats + 4 * row + c, mask=on, other=0.0)
+    valid = square > _MIN_SQUARE
+    inverse = tl.where(valid, tl.rsqrt(tl.where(valid, square, 1.0)), 0.0)
+    for c in tl.static_range(4):
+        q = tl.load(covariances + 7 * at + 3 + c, mask=on, other=0.0)
+        d_quat = tl.load(d_quats + 4 * row + c, mask=on, other=0.0)
+        d_q = inverse * (d_quat - q * along * inverse * inverse)
+        tl.store(to_covariances + 7 * at + 3 + c, d_q, mask=inside)

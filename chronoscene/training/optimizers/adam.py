@@ -418,7 +418,7 @@ class DenseTable:
         Args:
             rows: Each at most once. int64 [M]
         """
-        leaf = self.value.index_select(0, rows).requires_grad_()
+        leaf = self.value[rows].requires_grad_()  # on a GPU faster than index_select
         self.fetched = rows, leaf
         return leaf
 
