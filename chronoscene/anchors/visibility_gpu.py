@@ -37,7 +37,8 @@ def marked(
     if len(anchors):
         _mark[(triton.cdiv(len(anchors), BLOCK),)](
             anchors.contiguous(), log_scales.contiguous(), camera, mask, len(anchors),
-            *map(float, size), *depths, extent, blur, slack, COLUMNS=log_scales.shape[1], BLOCK=BLOCK,
+            *map(float, size), *depths, extent, blur, slack,
+            COLUMNS=log_scales.shape[1], BLOCK=BLOCK,
         )  # fmt: skip
     return mask
 

@@ -20,7 +20,7 @@ MOST_VIEWS = 4
 """Views of a step with ``views_per_step=auto``, at most."""
 
 SHARE_OF_GPU = 0.25
-"""Of the memory that a GPU has free at the start, for photos at most."""
+"""Largest share for photos of the memory that a GPU has free at the start."""
 
 AHEAD = 32
 """Number of draws that are known before they are made."""

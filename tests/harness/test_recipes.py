@@ -247,7 +247,7 @@ def test_recipes_are_registered_under_their_names():
 def test_a_program_is_described_with_its_commands():
     arguments = ["baselines.external:CHRONOGS"]
     text = CliRunner().invoke(methods_module.command, arguments, catch_exceptions=False).output
-    assert "external program, installed apart from ChronoScene; untested but for" in text
+    assert "external program, installed apart from ChronoScene; trained on an H200" in text
     assert "python '{source}/train.py' --config '{output}/config.yaml'" in text
     assert "prefix=\n    Words before each command" in text
 

@@ -2,12 +2,19 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.methods import TrainingView
 from chronoscene.training import views
-from chronoscene.training.views import AHEAD, ViewSampler, downscale_image, downscale_view
+from chronoscene.training.views import (
+    AHEAD,
+    PhotosOnDevice,
+    ViewSampler,
+    downscale_image,
+    downscale_view,
+)
 
 
 @given(st.integers(1, 40), st.integers(0, 2**32), st.integers(1, 4))
@@ -104,3 +111,23 @@ def test_a_point_lands_at_the_same_place() -> None:
     point = np.linalg.inv(original.K) @ [5.0, 3.0, 1.0]  # corner of pixels (4, 2) and (5, 3)
     np.testing.assert_allclose(small.K @ point, [2.5, 1.5, 1.0])
     np.testing.assert_array_equal(original.K[0], [50.0, 0.0, 4.0])
+
+
+def test_a_gpu_keeps_the_photos_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    photos, loaded = np.zeros((3, 10, 20, 3), np.uint8), []
+
+    class Three:
+        def load_image(self, number: int) -> np.ndarray:
+            loaded.append(number)
+            return photos[number]
+
+    room = int(2.5 * photos[0].nbytes / views.SHARE_OF_GPU)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (room, 2 * room))
+    monkeypatch.setattr(views, "to_device", lambda array, device: torch.from_numpy(array))
+    kept = PhotosOnDevice(Three(), torch.device("cuda"))  # type: ignore[arg-type]
+    for number in (0, 1, 2, 0, 1, 2):
+        assert kept[number].shape == (10, 20, 3)
+    assert loaded == [0, 1, 2, 2]
+    loaded.clear()
+    none = PhotosOnDevice(Three(), torch.device("cpu"))  # type: ignore[arg-type]
+    assert none[0] is not none[0] and loaded == [0, 0]

@@ -7,7 +7,7 @@ colour in one kernel, and only if it is switched on; another one takes the gradi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import triton
@@ -15,10 +15,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.nn.functional import linear
 
+from chronoscene.anchors.decode.inputs import DecodeInputs
 from chronoscene.anchors.decode.layout import MIN_DISTANCE, MIN_QUAT_NORM
-
-if TYPE_CHECKING:
-    from chronoscene.anchors.decode import DecodeInputs
 
 BLOCK = 256
 """Gaussians to a program."""

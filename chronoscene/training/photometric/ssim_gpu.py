@@ -39,11 +39,11 @@ def l1_ssim(image: Tensor, target: Tensor, weights: tuple[float, float]) -> tupl
     unit = 1 / 255 if target.dtype == torch.uint8 else 1.0
     plane = height * width
     _blur_rows_of_images[grid](image, target, unit, blurred, plane, width, BLOCK=BLOCK)
-    _compare[grid](blurred, slopes, sums, plane, height, width, weights[1], BLOCK=BLOCK)
+    _compare[grid](blurred, slopes, sums, plane, width, weights[1], BLOCK=BLOCK)
     _blur_rows_of_slopes[grid](slopes, blurred, plane, width, BLOCK=BLOCK)
     total = sums.sum()
     _differentiate[grid](
-        image, target, unit, blurred, gradient, sums, plane, height, width, *weights, BLOCK=BLOCK
+        image, target, unit, blurred, gradient, sums, plane, width, *weights, BLOCK=BLOCK
     )
     return total + sums.sum(), gradient
 
@@ -82,7 +82,7 @@ def _blur_rows_of_images(x, y, unit, out, plane, width, BLOCK: tl.constexpr):  #
 
 
 @triton.jit
-def _compare(maps, out, sums, plane, height, width, weight, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _compare(maps, out, sums, plane, width, weight, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     """Blur four maps along the columns; write what `_differentiate` blurs, and sums of 1 - S."""
     row = tl.program_id(1).to(tl.int64)
     column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -90,8 +90,8 @@ def _compare(maps, out, sums, plane, height, width, weight, BLOCK: tl.constexpr)
     mu = tl.zeros([BLOCK], tl.float32)
     nu, squares, gaps = mu, mu, mu
     for i in tl.static_range(-_RADIUS, _RADIUS + 1):
-        here, tap = maps + (row + i) * width + column, _tap(i)
-        there = inside & (row + i >= 0) & (row + i < height)
+        at, tap = (row + i) * width + column, _tap(i)
+        here, there = maps + at, inside & (at >= 0) & (at < plane)
         mu += tap * tl.load(here, mask=there, other=0.0)
         nu += tap * tl.load(here + plane, mask=there, other=0.0)
         squares += tap * tl.load(here + plane + plane, mask=there, other=0.0)
@@ -136,7 +136,7 @@ def _blur_rows_of_slopes(maps, out, plane, width, BLOCK: tl.constexpr):  # type:
 
 @triton.jit
 def _differentiate(  # type: ignore[no-untyped-def]
-    x, y, unit, maps, out, sums, plane, height, width, weight, other_weight, BLOCK: tl.constexpr
+    x, y, unit, maps, out, sums, plane, width, weight, other_weight, BLOCK: tl.constexpr
 ):
     """Blur three maps along the columns; write the gradient, and sums of |x - y|."""
     row = tl.program_id(1).to(tl.int64)
@@ -145,8 +145,8 @@ def _differentiate(  # type: ignore[no-untyped-def]
     one = tl.zeros([BLOCK], tl.float32)
     two, three = one, one
     for i in tl.static_range(-_RADIUS, _RADIUS + 1):
-        here, tap = maps + (row + i) * width + column, _tap(i)
-        there = inside & (row + i >= 0) & (row + i < height)
+        at, tap = (row + i) * width + column, _tap(i)
+        here, there = maps + at, inside & (at >= 0) & (at < plane)
         one += tap * tl.load(here, mask=there, other=0.0)
         two += tap * tl.load(here + plane, mask=there, other=0.0)
         three += tap * tl.load(here + plane + plane, mask=there, other=0.0)
