@@ -30,6 +30,7 @@ from chronoscene.harness.train import painted_balls
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, View, build_config
 from chronoscene.training.photometric import photometric_loss_reference
+from chronoscene.training.views import PhotosOnDevice
 
 
 @pytest.fixture(autouse=True)
@@ -353,6 +354,7 @@ def test_one_photo_of_a_period_is_that_of_the_camera_in_the_middle() -> None:
         assert torch.equal(found, trainer._read(number, torch.arange(len(found)))[0].detach())
     loaded: list[int] = []
     trainer.train = replace(scene, load_image=lambda i: (loaded.append(i), scene.load_image(i))[1])
+    trainer.photos = PhotosOnDevice(trainer.train, torch.device("cpu"))
     method.step(3, 0.1)
     assert loaded[0] == central_views(scene)[scene.views[loaded[1]].period]
 
