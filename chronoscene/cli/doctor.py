@@ -18,6 +18,7 @@ from chronoscene.cli.output import emit
 from chronoscene.errors import BackendError, ChronoSceneError
 from chronoscene.io.tables import Table, plain_text
 from chronoscene.io.wording import in_words
+from chronoscene.kernels import gpu
 from chronoscene.kernels.runtime import available_threads, gsplat_release, machine_memory
 from chronoscene.metrics.lpips_weights import candidate_files, check_available
 
@@ -128,9 +129,11 @@ def _cuda() -> Diagnosis:
         found = f"no device; this torch is built for {build}"
         return Diagnosis("CUDA", "missing", found, "not needed: methods are trained on the CPU")
     devices = (torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count()))
-    return Diagnosis(
-        "CUDA", "ok", ", ".join(f"{d.name}, {in_words(d.total_memory)}" for d in devices)
-    )
+    names = ", ".join(f"{d.name}, {in_words(d.total_memory)}" for d in devices)
+    if gpu.has_triton():
+        return Diagnosis("CUDA", "ok", f"{names}, triton {version('triton')}")
+    todo = "pip install triton, without which a GPU takes up to twice the time"
+    return Diagnosis("CUDA", "ok", f"{names}, no triton", todo)
 
 
 def _gsplat() -> Diagnosis:

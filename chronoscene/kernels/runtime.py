@@ -9,7 +9,6 @@ import sys
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from pathlib import Path
 
 from chronoscene.errors import BackendError
@@ -19,9 +18,6 @@ CONTAINER = Path("/sys/fs/cgroup")
 
 GSPLAT_ALPHA_MAX = {"1.5": 0.999, "1.6": 0.99}
 """Cap of alpha in the kernels of gsplat, by version. Others were not looked at and are refused."""
-
-HAS_TRITON = find_spec("triton") is not None
-"""True if kernels for a GPU can be compiled: Triton comes with torch for CUDA on Linux."""
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _KEPT_BYTES = 256 << 20

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from chronoscene.errors import BackendError
-from chronoscene.kernels.runtime import HAS_TRITON, gsplat_release
+from chronoscene.kernels import gpu
+from chronoscene.kernels.runtime import gsplat_release
 from chronoscene.rasterizer import RasterInfo, Rasterization, reference
 from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
 from chronoscene.rasterizer.inputs import Inputs, recentred
@@ -137,7 +138,7 @@ def _first_error(output: str) -> str:
 
 def _without_bad_rows(*arrays: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
     """Gaussians with nan, without a rotation or too faint to see, made invisible and harmless."""
-    if HAS_TRITON and arrays[0].is_cuda:
+    if arrays[0].is_cuda and gpu.compiles():
         from chronoscene.rasterizer.clean_gpu import cleaned
 
         made, good = cleaned(arrays, least_length=QUATERNION_MIN, least_opacity=ALPHA_MIN)

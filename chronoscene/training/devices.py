@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.kernels.runtime import HAS_TRITON
+from chronoscene.kernels import gpu
 
 
 def has_kernels(*tensors: Tensor) -> bool:
@@ -21,7 +21,7 @@ def has_kernels(*tensors: Tensor) -> bool:
 
 def has_gpu_kernels(*tensors: Tensor) -> bool:
     """Return True if our kernels for a GPU can work on tensors: float32 there, and Triton."""
-    return HAS_TRITON and all(t.is_cuda and t.dtype is torch.float32 for t in tensors)
+    return all(t.is_cuda and t.dtype is torch.float32 for t in tensors) and gpu.compiles()
 
 
 def to_device(array: NDArray[np.generic], device: str | torch.device) -> Tensor:

@@ -72,12 +72,17 @@ def test_full_machine(bare, monkeypatch, set_gsplat):
     monkeypatch.setattr("torch.cuda.get_device_properties", lambda number: device)
     monkeypatch.setattr(doctor, "find_spec", lambda name: ModuleSpec(name, None))
     monkeypatch.setattr(doctor, "version", lambda name: "1.5.3")
+    monkeypatch.setattr(doctor.gpu, "has_triton", lambda: True)
     set_gsplat("1.5.3")
     found = rows(run().stdout)
-    assert found["CUDA"] == ["ok", "GPU 1, 80.0 GB"]
+    assert found["CUDA"] == ["ok", "GPU 1, 80.0 GB, triton 1.5.3"]
     assert found["gsplat"] == ["ok", "gsplat 1.5.3"]
     assert found["extras"] == ["ok", "compress, flip, hloc, ray, survey, tune, view"]
     assert found["LPIPS weights"][1].endswith("vgg16-397923af.pth")
+    monkeypatch.setattr(doctor.gpu, "has_triton", lambda: False)
+    text = run().stdout
+    assert rows(text)["CUDA"] == ["ok", "GPU 1, 80.0 GB, no triton"]
+    assert "CUDA: pip install triton" in text
 
 
 def test_a_gsplat_of_another_version_is_not_ok(bare, set_gsplat):

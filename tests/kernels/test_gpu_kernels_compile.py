@@ -13,6 +13,7 @@ from triton.compiler import ASTSource, compile
 
 from chronoscene.anchors import visibility_gpu
 from chronoscene.anchors.decode import gpu as decode
+from chronoscene.kernels import gpu_trial
 from chronoscene.rasterizer import clean_gpu
 from chronoscene.training.photometric import ssim_gpu
 
@@ -23,7 +24,7 @@ TYPES = {
 NUMBERS = (
     "unit", "weight", "other_weight", "above", "near", "far", "extent", "blur", "slack", "length",
 )
-SIZES = {"BLOCK": 16, "K": 10, "WIDTH": 16, "COLUMNS": 6, "D": 3}
+SIZES = {"LENGTH": 4, "BLOCK": 16, "K": 10, "WIDTH": 16, "COLUMNS": 6, "D": 3}
 
 
 def build(module, name, **types):
@@ -39,6 +40,7 @@ def build(module, name, **types):
 build(visibility_gpu, "_mark", width="fp32", height="fp32")
 for name in ("_switch", "_place", "_learn"):
     build(decode, name)
+build(gpu_trial, "_count", numbers="*i32")
 build(clean_gpu, "_clean", opacity="fp32")
 for name in ("_blur_rows_of_images", "_compare", "_blur_rows_of_slopes", "_differentiate"):
     build(ssim_gpu, name)
@@ -53,4 +55,4 @@ def test_all_kernels_compile(tmp_path: os.PathLike[str]) -> None:
         [sys.executable, "-c", COMPILE], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    assert len(done.stdout.split()) == 9
+    assert len(done.stdout.split()) == 10
