@@ -158,7 +158,8 @@ def device_need(scene: Scene, needs: PhotoNeeds, spec: MethodSpec, config: Metho
     listed = ", ".join(f"{name} {_gb(size)}" for name, size in parts.items())
     return (
         f"{needs.scene}: {spec.name} takes about {_gb(sum(parts.values()))} of the GPU with "
-        f"{count:,} primitives in view: {listed}; an estimate, without what CUDA takes"
+        f"{count:,} primitives in view: {listed}; an estimate, without what CUDA takes. "
+        f"Photos stay there, too, up to a quarter of its free memory (here {_gb(needs.total)})"
     )
 
 

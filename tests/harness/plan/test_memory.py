@@ -94,7 +94,8 @@ def test_the_memory_of_a_gpu_is_estimated_by_parts(make_scene, settings):
     assert device_need(scene, needs, spec, config) == (
         "ring: 3dgs takes about 1.24 GB of the GPU with 1,000,000 primitives in view: model "
         "0.24 GB, gradients and moments 0.71 GB, drawn Gaussians 0.11 GB, rasterizer 0.18 GB, "
-        "images 0.00 GB; an estimate, without what CUDA takes"
+        "images 0.00 GB; an estimate, without what CUDA takes. "
+        "Photos stay there, too, up to a quarter of its free memory (here 0.00 GB)"
     )
     nerf = load_spec("nerf")
     assert device_need(scene, needs, nerf, build_config(nerf, preset="fast")) == ""
