@@ -85,7 +85,10 @@ class _Splats(torch.autograd.Function):
         count = len(anchors) * k
         flags = torch.empty(count, dtype=torch.int32, device=anchors.device)
         grid = (triton.cdiv(count, BLOCK),)
-        opacities, covariances, colors = (t.contiguous() for t in (opacities, covariances, colors))
+        anchors, used, opacities, covariances, colors, offsets, log_scales = (
+            t.contiguous()
+            for t in (anchors, used, opacities, covariances, colors, offsets, log_scales)
+        )
         if count:
             alphas = torch.empty_like(opacities)
             _switch[grid](opacities, used, alphas, flags, count, above, K=k, BLOCK=BLOCK)
