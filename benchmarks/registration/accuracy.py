@@ -137,7 +137,7 @@ def confusion(outcomes: list[Outcome]) -> str:
                 continue
             counts = "".join(f"{sum(o.verdict == v for o in mine):>10}" for v in levels)
             reasons = [o.reason for o in mine if o.reason]
-            often = max(set(reasons), key=reasons.count) if reasons else ""
+            often = max(sorted(set(reasons)), key=reasons.count) if reasons else ""
             lines.append(f"{family + (', right' if truth else ', wrong'):<48}{counts}   {often}")
     return "\n".join(lines)
 
