@@ -28,13 +28,7 @@ from chronoscene.training.checkpoint import TrainingState, check_views, parts
 from chronoscene.training.devices import has_kernels
 from chronoscene.training.drawing import camera_centre_tensor, draw_in_training, step_background
 from chronoscene.training.exposure import Exposure
-from chronoscene.training.gradients import (
-    BackwardPass,
-    collect_gradients,
-    joined,
-    judge_gradients,
-    mask_tensor,
-)
+from chronoscene.training.gradients import BackwardPass, collect_gradients, joined, judge_gradients
 from chronoscene.training.losses import mean_volume, training_loss
 from chronoscene.training.optimizers.adam import Pace
 from chronoscene.training.optimizers.summing import Part
@@ -154,10 +148,9 @@ class AnchorTrainer:
 
     def _draw(self) -> Drawn:
         """Draw the next view and load its photo."""
-        number, device = self.sampler.next(), self.model.device
-        return Drawn(
-            number, self.sampler.drawn, self.photos[number], mask_tensor(self.train, number, device)
-        )
+        number = self.sampler.next()
+        photo, mask = self.photos.photo(number), self.photos.mask(number)
+        return Drawn(number, self.sampler.drawn, photo, mask)
 
     def _learn(self, due: Drawn) -> ViewPass:
         """Draw a training view and collect gradients; the model and its optimiser stay."""

@@ -27,7 +27,7 @@ from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import TrainingState, check_views, parts
 from chronoscene.training.drawing import Splats, draw_in_training
 from chronoscene.training.exposure import Exposure
-from chronoscene.training.gradients import BackwardPass, collect_gradients, joined, mask_tensor
+from chronoscene.training.gradients import BackwardPass, collect_gradients, joined
 from chronoscene.training.losses import steady_mean, training_loss
 from chronoscene.training.optimizers.adam import Adam, Pace
 from chronoscene.training.optimizers.summing import Part, add_gradients
@@ -185,7 +185,7 @@ class GaussianTrainer:
         raster = draw_in_training(
             splats, view, self.background, self.config, seed=self.seed, number=self.sampler.drawn
         )
-        mask = mask_tensor(self.train, number, self.background.device)
+        mask = self.photos.mask(number)
         self.optimizer.zero_grad()
         result = collect_gradients(
             self.loss(raster, number, mask) + self._regulariser(splats),
@@ -243,7 +243,7 @@ class GaussianTrainer:
         """Photometric loss against the photo of view ``number``; methods may add terms."""
         return training_loss(
             raster,
-            self.photos[number],
+            self.photos.photo(number),
             mask,
             number=number,
             exposure=self.exposure,

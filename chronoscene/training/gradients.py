@@ -8,10 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from chronoscene.methods import TrainingSet
 from chronoscene.methods.interface import Skipped
 from chronoscene.rasterizer import RasterInfo
-from chronoscene.training.devices import to_device
 from chronoscene.training.optimizers.adam import all_finite
 
 
@@ -94,9 +92,3 @@ def centres_count(means2d: Tensor, mask: Tensor) -> Tensor:
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     x, y = (torch.where(inside, place, 0.0).long() for place in (x, y))
     return mask[y, x] | ~inside
-
-
-def mask_tensor(train: TrainingSet, index: int, device: str | torch.device) -> Tensor | None:
-    """Return where the photo of a training view counts; None for everywhere. bool [H, W]"""
-    mask = train.load_mask(index)
-    return None if mask is None else to_device(mask.copy(), device)

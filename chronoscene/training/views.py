@@ -70,7 +70,7 @@ class ViewSampler:
 
 
 class PhotosOnDevice:
-    """Photos of a training set as tensors on a device; a GPU keeps those for which it has room.
+    """Photos and masks of a training set as tensors; a GPU keeps those for which it has room.
 
     Args:
         train: The training set.
@@ -79,20 +79,30 @@ class PhotosOnDevice:
 
     def __init__(self, train: TrainingSet, device: torch.device) -> None:
         self._train, self._device = train, device
-        self._kept: dict[int, Tensor] = {}
+        self._kept: dict[tuple[str, int], Tensor] = {}
         self._room = 0
         if device.type == "cuda":
             self._room = int(SHARE_OF_GPU * torch.cuda.mem_get_info(device)[0])
 
-    def __getitem__(self, number: int) -> Tensor:
+    def photo(self, number: int) -> Tensor:
         """Return the photo of a view. uint8 [H, W, 3]"""
-        if number in self._kept:
-            return self._kept[number]
-        photo = to_device(self._train.load_image(number), self._device)
-        if photo.nbytes <= self._room:
-            self._kept[number] = photo
-            self._room -= photo.nbytes
-        return photo
+        if (known := self._kept.get(("photo", number))) is not None:
+            return known
+        return self._keep("photo", number, self._train.load_image(number))
+
+    def mask(self, number: int) -> Tensor | None:
+        """Return where the photo of a view counts; None for everywhere. bool [H, W]"""
+        if (known := self._kept.get(("mask", number))) is not None:
+            return known
+        mask = self._train.load_mask(number)
+        return None if mask is None else self._keep("mask", number, mask.copy())
+
+    def _keep(self, kind: str, number: int, array: NDArray[np.generic]) -> Tensor:
+        tensor = to_device(array, self._device)
+        if tensor.nbytes <= self._room:
+            self._kept[kind, number] = tensor
+            self._room -= tensor.nbytes
+        return tensor
 
 
 def count_views(option: int | Literal["auto"]) -> int:

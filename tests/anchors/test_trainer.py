@@ -21,6 +21,7 @@ from chronoscene.training.drawing import camera_centre_tensor, camera_tensors
 from chronoscene.training.gradients import BackwardPass, joined
 from chronoscene.training.losses import mean_volume
 from chronoscene.training.photometric import photometric_loss
+from chronoscene.training.views import PhotosOnDevice
 
 AT_THRESHOLDS = 5e-3
 """Largest error of a gradient, relative to the largest of its tensor. Measured in 21 steps: 2.5e-3
@@ -135,6 +136,7 @@ def test_views_that_are_skipped_take_no_part(monkeypatch: pytest.MonkeyPatch) ->
     drawn, hidden = masked.sampler.drawn, np.zeros((30, 40), bool)
     first, ignored, *others = (masked.sampler._view(draw) for draw in range(drawn, drawn + 4))
     masked.train = replace(masked.train, load_mask=lambda i: hidden if i == ignored else None)
+    masked.photos = PhotosOnDevice(masked.train, torch.device("cpu"))
     rest = iter([first, *others])
     monkeypatch.setattr(fewer.sampler, "next", lambda: next(rest))
     fewer.views = 3

@@ -113,21 +113,29 @@ def test_a_point_lands_at_the_same_place() -> None:
     np.testing.assert_array_equal(original.K[0], [50.0, 0.0, 4.0])
 
 
-def test_a_gpu_keeps_the_photos_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    photos, loaded = np.zeros((3, 10, 20, 3), np.uint8), []
+def test_a_gpu_keeps_the_photos_and_masks_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    photos, masks, loaded = np.zeros((3, 10, 20, 3), np.uint8), np.ones((3, 10, 20), bool), []
 
     class Three:
         def load_image(self, number: int) -> np.ndarray:
-            loaded.append(number)
+            loaded.append(("photo", number))
             return photos[number]
+
+        def load_mask(self, number: int) -> np.ndarray | None:
+            loaded.append(("mask", number))
+            return masks[number] if number else None
 
     room = int(2.5 * photos[0].nbytes / views.SHARE_OF_GPU)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (room, 2 * room))
     monkeypatch.setattr(views, "to_device", lambda array, device: torch.from_numpy(array))
     kept = PhotosOnDevice(Three(), torch.device("cuda"))  # type: ignore[arg-type]
     for number in (0, 1, 2, 0, 1, 2):
-        assert kept[number].shape == (10, 20, 3)
-    assert loaded == [0, 1, 2, 2]
+        assert kept.photo(number).shape == (10, 20, 3)
+    assert loaded == [("photo", n) for n in (0, 1, 2, 2)]
+    loaded.clear()
+    assert kept.mask(0) is None and kept.mask(1) is kept.mask(1)
+    assert loaded == [("mask", 0), ("mask", 1)]
     loaded.clear()
     none = PhotosOnDevice(Three(), torch.device("cpu"))  # type: ignore[arg-type]
-    assert none[0] is not none[0] and loaded == [0, 0]
+    assert none.photo(0) is not none.photo(0) and none.mask(1) is not none.mask(1)
+    assert len(loaded) == 4
