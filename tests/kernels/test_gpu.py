@@ -1,4 +1,4 @@
-"""What Triton can do on this machine."""
+"""A trial of Triton on this machine, and the warning where it fails."""
 
 import sys
 import warnings

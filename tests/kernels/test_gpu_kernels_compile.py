@@ -7,7 +7,6 @@ import sys
 import pytest
 
 COMPILE = """
-import sys
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, compile
 

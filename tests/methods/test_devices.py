@@ -40,7 +40,7 @@ STEPS = 3
 EPS = 1e-4
 """Of Adam, where trainings are compared."""
 LOSS_TOLERANCE = {"cpu": 1e-6, "cuda": 1e-4}
-"""Of the losses, relatively. Measured on a CPU: 1.2e-7. On an H200 all of these hold."""
+"""Relative, of the losses. Measured on a CPU: 1.2e-7. On an H200 all of these hold."""
 IMAGE_TOLERANCE = {"cpu": 2e-6, "cuda": 1e-3}
 """Of images after `STEPS`. Measured on a CPU: 2e-7."""
 RENDER_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from chronoscene.anchors.decode.function import Decode
-from chronoscene.anchors.decode.inputs import DecodeInputs, HeadWeights
-from chronoscene.anchors.decode.layout import MIN_DISTANCE, MIN_QUAT_NORM
+from chronoscene.anchors.decode.inputs import DecodeInputs, HeadWeights, directions
+from chronoscene.anchors.decode.layout import MIN_QUAT_NORM
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
 from chronoscene.training import devices
@@ -57,14 +57,11 @@ def decode_reference(x: DecodeInputs) -> Splats:
     shape = (len(visible), x.block_rows.shape[1], x.blocks.shape[1])
     blocks = x.blocks.index_select(0, rows).view(shape)
     centres = x.anchors.index_select(0, visible).detach()
-    directions = centres - x.camera_centre.detach()
-    lengths = directions.norm(dim=-1, keepdim=True)
-    directions = torch.where(lengths > MIN_DISTANCE, directions / lengths, 0)
     inputs = torch.cat(
         (
             x.features.index_select(0, visible),
             torch.einsum("t,mtv->mv", x.period_weights[: blocks.shape[1]], blocks),
-            directions,
+            directions(centres, x.camera_centre),
             (x.period_weights @ x.global_features).expand(len(visible), -1),
         ),
         dim=-1,

@@ -15,8 +15,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.nn.functional import linear
 
-from chronoscene.anchors.decode.inputs import DecodeInputs
-from chronoscene.anchors.decode.layout import MIN_DISTANCE, MIN_QUAT_NORM
+from chronoscene.anchors.decode.inputs import DecodeInputs, directions
+from chronoscene.anchors.decode.layout import MIN_QUAT_NORM
 
 BLOCK = 256
 """Gaussians to a program."""
@@ -32,7 +32,7 @@ def decode(x: DecodeInputs, above: float) -> tuple[Sequence[Tensor], Tensor]:
     """
     of_each = x.anchors.detach(), x.used_offsets, x.offsets, x.features, x.log_scales
     anchors, used, offsets, features, log_scales = (_seen(x, tensor) for tensor in of_each)
-    inputs = torch.cat([features, _blocks(x), _directions(anchors, x.camera_centre)], dim=1)
+    inputs = torch.cat([features, _blocks(x), directions(anchors, x.camera_centre)], dim=1)
     opacity, covariance, color = _outputs(x, inputs)
     *splats, index = _Splats.apply(
         above, anchors, used, torch.tanh(opacity), covariance, color, offsets, log_scales
@@ -51,12 +51,6 @@ def _blocks(x: DecodeInputs) -> Tensor:
     blocks = x.blocks.index_select(0, rows.flatten()).view(*rows.shape, x.blocks.shape[1])
     weights = x.period_weights[: rows.shape[1], None]
     return (blocks * weights).sum(1) if rows.shape[1] > 1 else blocks.flatten(1) * weights[:, 0]
-
-
-def _directions(anchors: Tensor, camera_centre: Tensor) -> Tensor:
-    offsets = anchors - camera_centre.detach()
-    lengths = offsets.norm(dim=1, keepdim=True)
-    return torch.where(lengths > MIN_DISTANCE, offsets / lengths, 0)
 
 
 def _outputs(x: DecodeInputs, inputs: Tensor) -> Sequence[Tensor]:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from chronoscene.anchors.decode.layout import MIN_DISTANCE
+
 
 class HeadWeights(NamedTuple):
     """One MLP with a ReLU hidden layer. I inputs, H hidden units, O outputs.
@@ -66,3 +68,10 @@ class DecodeInputs(NamedTuple):
     @property
     def heads(self) -> tuple[HeadWeights, HeadWeights, HeadWeights]:
         return self.opacity_head, self.covariance_head, self.color_head
+
+
+def directions(centres: Tensor, camera_centre: Tensor) -> Tensor:
+    """Return unit vectors from the camera to anchors; zero for one in the camera. [M, 3]"""
+    offsets = centres - camera_centre.detach()
+    lengths = offsets.norm(dim=-1, keepdim=True)
+    return torch.where(lengths > MIN_DISTANCE, offsets / lengths, 0)

@@ -58,6 +58,28 @@ def _tap(i: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
+def _along_row(maps, row, column, width, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Blur a map along a row."""
+    total = tl.zeros([BLOCK], tl.float32)
+    for i in tl.static_range(-_RADIUS, _RADIUS + 1):
+        at = column + i * _CHANNELS
+        inside = (at >= 0) & (at < width)
+        total += _tap(i) * tl.load(maps + row * width + at, mask=inside, other=0.0)
+    return total
+
+
+@triton.jit
+def _along_columns(maps, row, column, plane, width, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Blur a map along its columns."""
+    total = tl.zeros([BLOCK], tl.float32)
+    for i in tl.static_range(-_RADIUS, _RADIUS + 1):
+        at = (row + i) * width + column
+        inside = (column < width) & (at >= 0) & (at < plane)
+        total += _tap(i) * tl.load(maps + at, mask=inside, other=0.0)
+    return total
+
+
+@triton.jit
 def _blur_rows_of_images(x, y, unit, out, plane, width, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     """Blur x, y, x² + y² and (x - y)² along the rows. [H, 3 W] -> [4, H, 3 W]"""
     row = tl.program_id(1).to(tl.int64)
@@ -87,15 +109,10 @@ def _compare(maps, out, sums, plane, width, weight, BLOCK: tl.constexpr):  # typ
     row = tl.program_id(1).to(tl.int64)
     column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = column < width
-    mu = tl.zeros([BLOCK], tl.float32)
-    nu, squares, gaps = mu, mu, mu
-    for i in tl.static_range(-_RADIUS, _RADIUS + 1):
-        at, tap = (row + i) * width + column, _tap(i)
-        here, there = maps + at, inside & (at >= 0) & (at < plane)
-        mu += tap * tl.load(here, mask=there, other=0.0)
-        nu += tap * tl.load(here + plane, mask=there, other=0.0)
-        squares += tap * tl.load(here + plane + plane, mask=there, other=0.0)
-        gaps += tap * tl.load(here + plane + plane + plane, mask=there, other=0.0)
+    mu = _along_columns(maps, row, column, plane, width, BLOCK)
+    nu = _along_columns(maps + plane, row, column, plane, width, BLOCK)
+    squares = _along_columns(maps + plane + plane, row, column, plane, width, BLOCK)
+    gaps = _along_columns(maps + plane + plane + plane, row, column, plane, width, BLOCK)
     e = mu - nu
     both_squares = mu * mu + nu * nu
     # Rounding must not take a variance below 0, nor var(x - y) above 2 var(x) + 2 var(y).
@@ -119,19 +136,10 @@ def _blur_rows_of_slopes(maps, out, plane, width, BLOCK: tl.constexpr):  # type:
     """Blur three maps along the rows. [3, H, 3 W]"""
     row = tl.program_id(1).to(tl.int64)
     column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    one = tl.zeros([BLOCK], tl.float32)
-    two, three = one, one
-    for i in tl.static_range(-_RADIUS, _RADIUS + 1):
-        at = column + i * _CHANNELS
-        inside = (at >= 0) & (at < width)
-        here, tap = maps + row * width + at, _tap(i)
-        one += tap * tl.load(here, mask=inside, other=0.0)
-        two += tap * tl.load(here + plane, mask=inside, other=0.0)
-        three += tap * tl.load(here + plane + plane, mask=inside, other=0.0)
-    there, inside = out + row * width + column, column < width
-    tl.store(there, one, mask=inside)
-    tl.store(there + plane, two, mask=inside)
-    tl.store(there + plane + plane, three, mask=inside)
+    there = out + row * width + column
+    for _ in tl.static_range(3):
+        tl.store(there, _along_row(maps, row, column, width, BLOCK), mask=column < width)
+        maps, there = maps + plane, there + plane
 
 
 @triton.jit
@@ -142,14 +150,9 @@ def _differentiate(  # type: ignore[no-untyped-def]
     row = tl.program_id(1).to(tl.int64)
     column = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = column < width
-    one = tl.zeros([BLOCK], tl.float32)
-    two, three = one, one
-    for i in tl.static_range(-_RADIUS, _RADIUS + 1):
-        at, tap = (row + i) * width + column, _tap(i)
-        here, there = maps + at, inside & (at >= 0) & (at < plane)
-        one += tap * tl.load(here, mask=there, other=0.0)
-        two += tap * tl.load(here + plane, mask=there, other=0.0)
-        three += tap * tl.load(here + plane + plane, mask=there, other=0.0)
+    one = _along_columns(maps, row, column, plane, width, BLOCK)
+    two = _along_columns(maps + plane, row, column, plane, width, BLOCK)
+    three = _along_columns(maps + plane + plane, row, column, plane, width, BLOCK)
     at = row * width + column
     a = tl.load(x + at, mask=inside, other=0.0)
     b = tl.load(y + at, mask=inside, other=0).to(tl.float32) * unit

@@ -246,7 +246,7 @@ def test_wrong_rows() -> None:
 
 
 def test_fused_updates_are_those_of_torch() -> None:
-    """What a GPU runs, with learning rates that differ, and a tensor without rows."""
+    """The code of a GPU, with learning rates that differ, and a tensor without rows."""
     generator = torch.Generator().manual_seed(0)
     shapes, rates = {"a": (50, 3), "b": (7,), "none": (0, 3)}, {"a": 0.01, "b": 0.1, "none": 1.0}
     mine = {n: torch.randn(s, generator=generator).requires_grad_() for n, s in shapes.items()}
