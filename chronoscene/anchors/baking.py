@@ -9,6 +9,9 @@ the given views
   each view, it adds as much to all of them together as before;
 - the colour has the spherical harmonics that fit the colours of the views best, by weighted least
   squares, held near the constant one where views are few or all on one side.
+
+Weights are those in views with few pixels, which cost a fraction of the time and no quality
+(docs/guides/using-a-run.md, "Gaussians for other programs").
 """
 
 from __future__ import annotations
@@ -26,11 +29,12 @@ from chronoscene.methods import View
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.drawing import Splats, camera_centre_tensor
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, NUM_BASES, basis
+from chronoscene.training.views import coarse_view
 
 RIDGE = 0.01
 """Penalty on the squares of all coefficients but the constant one, as a share of all weights."""
 MIN_WEIGHT = 1e-3
-"""Pixels that a Gaussian must fill, over all views together, to be kept."""
+"""Pixels of coarse views that a Gaussian must fill, over all together, to be kept."""
 _SHAPES: dict[str, tuple[int, ...]] = {
     "total": (),
     "light": (),
@@ -55,7 +59,7 @@ def bake(model: AnchorModel, period_weights: Tensor, views: Sequence[View]) -> G
     """
     sums = _Sums(len(model) * model.layout.offsets)
     for view in views:
-        sums.add(view, *_seen(model, period_weights, view))
+        sums.add(view, *_seen(model, period_weights, coarse_view(view)))
     return sums.gaussians()
 
 

@@ -21,6 +21,7 @@ from chronoscene.methods import View
 from chronoscene.rasterizer.reference import filter_factors
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.drawing import Splats, camera_tensors, weights_in
+from chronoscene.training.views import coarse_view
 
 
 def adapt_to_plain(
@@ -40,8 +41,9 @@ def adapt_to_plain(
     weights = torch.zeros_like(splats.opacities)
     weighted = torch.zeros_like(splats.opacities)
     for view in views:
-        everywhere = torch.ones(view.height, view.width, 3, device=device)
-        added = weights_in(splats, view, everywhere, near_plane=near_plane, antialiased=True)[:, 0]
+        small = coarse_view(view)
+        everywhere = torch.ones(small.height, small.width, 3, device=device)
+        added = weights_in(splats, small, everywhere, near_plane=near_plane, antialiased=True)[:, 0]
         seen = added > 0
         viewmats, Ks = camera_tensors(view, device)
         factors = filter_factors(*shape, viewmats[0], Ks[0], view.width, view.height)

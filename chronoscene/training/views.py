@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal
+from math import isqrt
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -12,15 +13,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.kernels.thread_pool import num_workers
-from chronoscene.methods import TrainingSet, TrainingView
+from chronoscene.methods import TrainingSet, View
 from chronoscene.methods.interface import nothing_ahead
 from chronoscene.training.devices import to_device
+
+V = TypeVar("V", bound=View)
 
 MOST_VIEWS = 4
 """Views of a step with ``views_per_step=auto``, at most."""
 
 SHARE_OF_GPU = 0.25
 """Largest share for photos of the memory that a GPU has free at the start."""
+
+COARSE_PIXELS = 320 * 240
+"""Pixels of a view in which weights of Gaussians are measured, at least, if it has as many."""
 
 AHEAD = 32
 """Number of draws that are known before they are made."""
@@ -135,7 +141,7 @@ def is_due(index: int, views: int, interval: int) -> bool:
     return (index + views) // interval > index // interval
 
 
-def downscale_view(view: TrainingView, factor: int) -> TrainingView:
+def downscale_view(view: V, factor: int) -> V:
     """Return the view at 1/factor of its size; what fills no whole pixel is cut off.
 
     Pixel (0, 0) is centred at (0.5, 0.5), so image positions are divided by the factor.
@@ -144,6 +150,14 @@ def downscale_view(view: TrainingView, factor: int) -> TrainingView:
     K[:2] /= factor
     width, height = max(view.width // factor, 1), max(view.height // factor, 1)
     return replace(view, K=K, width=width, height=height)
+
+
+def coarse_view(view: V) -> V:
+    """Return the view at the smallest 1/n of its size that has `COARSE_PIXELS`.
+
+    That many show how much each Gaussian adds to a view, beside the others.
+    """
+    return downscale_view(view, max(isqrt(view.width * view.height // COARSE_PIXELS), 1))
 
 
 def downscale_image(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:

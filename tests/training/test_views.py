@@ -12,6 +12,7 @@ from chronoscene.training.views import (
     AHEAD,
     PhotosOnDevice,
     ViewSampler,
+    coarse_view,
     downscale_image,
     downscale_view,
 )
@@ -111,6 +112,14 @@ def test_a_point_lands_at_the_same_place() -> None:
     point = np.linalg.inv(original.K) @ [5.0, 3.0, 1.0]  # corner of pixels (4, 2) and (5, 3)
     np.testing.assert_allclose(small.K @ point, [2.5, 1.5, 1.0])
     np.testing.assert_array_equal(original.K[0], [50.0, 0.0, 4.0])
+
+
+@pytest.mark.parametrize(
+    ("size", "factor"), [((48, 36), 1), ((640, 479), 1), ((640, 480), 2), ((1201, 901), 3)]
+)
+def test_coarse_views_keep_pixels_enough(size: tuple[int, int], factor: int) -> None:
+    small = coarse_view(view(*size))
+    assert (small.width, small.height) == (size[0] // factor, size[1] // factor)
 
 
 def test_a_gpu_keeps_the_photos_and_masks_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,9 @@ from chronoscene.scene.orbit import find_up
 from chronoscene.scene.similarity import Sim3
 
 LIMIT_DB = 0.3
-"""PSNR that plain viewers may lose on the training views, for them to be the default."""
+"""PSNR that plain viewers may lose on training views, for them to be the default."""
+JUDGED_VIEWS = 24
+"""Training views of the period by which that is judged, at most: every n-th."""
 FAR_AWAY = 2_000.0
 """Coordinate of the median camera, in units of the scene, beyond which an offset is subtracted."""
 
@@ -72,7 +74,7 @@ def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = 
         scene: The scene that it was trained on.
         period: Period of the Gaussians.
         viewers: ``plain`` for viewers without the antialiasing filter, ``antialiased`` for those
-            with it; None for plain ones if that loses less than `LIMIT_DB` on the training views.
+            with it; None for plain ones if that loses less than `LIMIT_DB` on training views.
 
     Raises:
         ConfigError: If there are no Gaussians, or the run has no filter.
@@ -179,8 +181,9 @@ def _adapted(
     plain = Prepared(after.transformed(training_from_local.inverse()), filtered.offset, False)
     if viewers == "plain":
         return plain
-    with_filter = measure_loss(run, scene, period, before, frames)
-    without = measure_loss(run, scene, period, after, frames)
+    judged = frames[:: -(-len(frames) // JUDGED_VIEWS) or 1]
+    with_filter = measure_loss(run, scene, period, before, judged)
+    without = measure_loss(run, scene, period, after, judged)
     if with_filter is None or without is None or with_filter.filtered is None:
         return plain
     return plain if with_filter.filtered - without.plain < LIMIT_DB else filtered
