@@ -23,6 +23,8 @@ from chronoscene.kernels.compilation import kernel
 from chronoscene.training import devices
 from chronoscene.training.points import rms_spacing
 
+COARSER = 1.02
+"""Ratio of the voxel edges that are tried where a cloud would have too many anchors."""
 MIN_DISTANCE = 1e-7
 """Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""
 
@@ -91,10 +93,15 @@ def voxelize(
         size: Voxel edge, in the units of the points.
         origin: See `AnchorConfig.voxel_origin`.
     """
-    corner = points.min(axis=0).astype(np.float64) if origin == "box" else np.zeros(3)
+    corner = _corner(points, origin)
     cells = cell_indices(torch.from_numpy(points - corner), size)
     _, first = np.unique(pack_cells(cells).numpy(), return_index=True)
     return (cells.numpy()[first] * size + corner).astype(np.float32)
+
+
+def _corner(points: NDArray[np.floating], origin: str) -> NDArray[np.float64]:
+    """Return where cells are counted from. [3]"""
+    return points.min(axis=0).astype(np.float64) if origin == "box" else np.zeros(3)
 
 
 def initial_anchors(
@@ -104,13 +111,23 @@ def initial_anchors(
 
     Returns:
         anchors: [A, 3]
-        size: The voxel edge that was used.
+        size: The voxel edge that was used: ``size`` times a power of `COARSER`.
     """
-    anchors = voxelize(points, size, origin)
-    while limit > 0 and len(anchors) > limit:
-        size *= 1.1
-        anchors = voxelize(points, size, origin)
-    return anchors, size
+    if limit > 0:
+        offsets = torch.from_numpy(points - _corner(points, origin))
+
+        def fits(exponent: int) -> bool:
+            keys = np.sort(pack_cells(cell_indices(offsets, size * COARSER**exponent)).numpy())
+            return bool(np.count_nonzero(np.diff(keys)) < limit)
+
+        low, high = -1, 0  # between what is too fine and what fits
+        while not fits(high):
+            low, high = high, 2 * high + 16
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if fits(middle) else (middle, high)
+        size *= COARSER**high
+    return voxelize(points, size, origin), size
 
 
 def initial_log_scales(anchors: NDArray[np.floating]) -> NDArray[np.float32]:

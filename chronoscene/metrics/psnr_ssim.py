@@ -19,6 +19,7 @@ from chronoscene.errors import ShapeError
 
 WINDOW = 11  # Taps of the SSIM window per axis
 SIGMA = 1.5  # Standard deviation of the SSIM window in pixels
+_ROWS = 48  # Of a map of SSIM that are computed at a time
 C1, C2 = 0.01**2, 0.03**2
 """Stabilisers of SSIM for data range 1 (Wang et al. 2004)."""
 
@@ -108,6 +109,16 @@ def ssim_map(image: ArrayLike, reference: ArrayLike) -> Array:
     Source: Wang et al. 2004, eq. 13.
     """
     a, b = unit_pair(image, reference)
+    found, reach = np.empty_like(a), WINDOW // 2
+    for start in range(0, len(a), _ROWS):  # a few rows at a time, which stay in the cache
+        end, low = start + _ROWS, max(start - reach, 0)
+        similar = _similarity(a[low : end + reach], b[low : end + reach])
+        found[start:end] = similar[start - low : end - low]
+    return found
+
+
+def _similarity(a: Array, b: Array) -> Array:
+    """`ssim_map` of two images of float64."""
     mu_a, mu_b = _blur(a), _blur(b)
     var_a = _blur(a * a) - mu_a * mu_a
     var_b = _blur(b * b) - mu_b * mu_b

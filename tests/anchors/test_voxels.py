@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.anchors.density import (
+    COARSER,
     MIN_DISTANCE,
     cell_indices,
     initial_anchors,
@@ -88,7 +89,7 @@ def test_the_limit_coarsens_the_voxel(grid: np.ndarray) -> None:
     anchors, size = initial_anchors(grid, 0.5, limit=60)
     assert 1 <= len(anchors) <= 60
     assert size > 2.0
-    assert len(voxelize(grid, size / 1.1)) > 60, "it is no coarser than needed"
+    assert len(voxelize(grid, size / COARSER)) > 60, "it is no coarser than needed"
     everything, unchanged = initial_anchors(grid, 0.5, limit=125)
     assert (len(everything), unchanged) == (125, 0.5)
 

@@ -59,6 +59,8 @@ MIN_ROWS = 256
 """Tensors with fewer rows are not worth a table of symbols."""
 PROBE_VIEWS, LOSS_VIEWS = 9, 24
 """Training views on which columns, and the loss, are measured; see `spread`."""
+PROBE_WIDTH = 400
+"""Pixels in a row of the images on which columns are measured, at most."""
 ROUNDS, LEAST = 7, -24.0
 """Rounds of bisection; exponent of two, relative to the first guess, at which it gives up."""
 
@@ -72,16 +74,20 @@ class _SortedModel:
     run: TrainedRun
     frames: tuple[Frame, ...]
     store: ImageStore
+    small: ImageStore
+    """The same images with at most `PROBE_WIDTH` pixels in a row."""
     scratch: Path
     """Folder with the sorted model; its tensors are replaced to render others."""
     tensors: Arrays
     grids: Mapping[str, Grid]
 
-    def images(self, tensors: Arrays, frames: tuple[Frame, ...]) -> list[NDArray[np.float32]]:
-        """Render some views with other tensors."""
+    def images(
+        self, tensors: Arrays, frames: tuple[Frame, ...], store: ImageStore
+    ) -> list[NDArray[np.float32]]:
+        """Render some views with other tensors, in the size of the images of a store."""
         _save(self.scratch, tensors)
         model, run = self.run.load(self.scratch), self.run
-        views = [run.view(self.store.camera(f), f.cam_from_world) for f in frames]
+        views = [run.view(store.camera(f), f.cam_from_world) for f in frames]
         periods = [run.model_period(f.period) for f in frames]
         return [model.render(v, p).rgb for v, p in zip(views, periods, strict=True)]
 
@@ -101,7 +107,7 @@ class _SortedModel:
         """Mean PSNR over training views."""
         frames = spread(self.frames, LOSS_VIEWS)
         values = []
-        for frame, image in zip(frames, self.images(tensors, frames), strict=True):
+        for frame, image in zip(frames, self.images(tensors, frames, self.store), strict=True):
             mask = self.store.load_mask(frame)
             if mask is None or mask.any():
                 values.append(psnr(to_bytes(image), self.store.load(frame), mask))
@@ -140,7 +146,7 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
         for number in range(run.num_periods) if run.strategy.model_per_period else (None,):
             part = "" if number is None else period_part(number)
             frames = scene.select(split="train", period=number)
-            with _opened(run, number or 0, frames, store) as opened:
+            with _opened(run, number or 0, scene, frames) as opened:
                 rules = None
                 if max_loss is not None:
                     rules = _fit(opened, max_loss, log)
@@ -160,7 +166,7 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
 
 @contextmanager
 def _opened(
-    run: TrainedRun, period: int, frames: tuple[Frame, ...], store: ImageStore
+    run: TrainedRun, period: int, scene: Scene, frames: tuple[Frame, ...]
 ) -> Iterator[_SortedModel]:
     model: Method = run.model(period)
     if not hasattr(model, "permute"):
@@ -179,7 +185,9 @@ def _opened(
         model.permute(np.argsort(morton(grid.codes(stored[name])), kind="stable"))
         model.save(scratch)
         tensors = load_file(scratch / TENSOR_FILE)
-        yield _SortedModel(run, frames, store, scratch, tensors, {name: grid})
+        width = run.record.max_width
+        store, small = (ImageStore(scene, max_width=w) for w in (width, min(width, PROBE_WIDTH)))
+        yield _SortedModel(run, frames, store, small, scratch, tensors, {name: grid})
 
 
 def _fit(model: _SortedModel, max_loss: float, log: Log) -> dict[str, Columns]:
@@ -234,7 +242,7 @@ def _sensitivity(
 ) -> dict[str, NDArray[np.float64]]:
     """Measure k_c of every column, by rounding one after the other."""
     frames = spread(model.frames, PROBE_VIEWS)
-    plain = model.images(model.tensors, frames)
+    plain = model.images(model.tensors, frames, model.small)
     found = {}
     for name, rule in rules.items():
         rows = _rows(model.tensors[name])
@@ -248,7 +256,7 @@ def _sensitivity(
             one = exact.copy()
             one[:, c] = rounded[:, c] * step
             tensor = rule.turn_back(one).reshape(model.tensors[name].shape)
-            images = model.images(model.tensors | {name: tensor}, frames)
+            images = model.images(model.tensors | {name: tensor}, frames, model.small)
             change = [float(np.mean((a - b) ** 2)) for a, b in zip(images, plain, strict=True)]
             found[name][c] = np.mean(change) / float(step) ** 2
     return found

@@ -107,7 +107,7 @@ def test_the_model_of_a_period_is_judged_by_photos_of_that_period(
     judged = []
 
     @contextmanager
-    def opened(run, period, frames, store):
+    def opened(run, period, scene, frames):
         judged.append((period, {(frame.period, frame.split) for frame in frames}))
         yield SimpleNamespace(tensors={}, grids={}, scratch=None)
 
