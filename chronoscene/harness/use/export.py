@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene import __version__, splat_files
+from chronoscene.arrays import Array
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
 from chronoscene.io.wording import counted
+from chronoscene.methods import Prediction, View
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
@@ -147,20 +149,35 @@ def measure_loss(
     Returns:
         None where no photo shows anything.
     """
+    model, filtered = run.model(period), run.is_filtered
+
+    def images(view: View) -> Iterator[Prediction]:
+        yield model.render(view, run.model_period(period))
+        yield model.render_gaussians(gaussians, view)
+        if filtered:
+            yield model.render_gaussians(gaussians, view, plain=True)
+
+    values = _psnr(run, scene, frames, images)
+    if not len(values):
+        return None
+    own, *exported = values.mean(axis=0).tolist()
+    return ExportLoss(len(values), own, exported[-1], exported[0] if filtered else None)
+
+
+def _psnr(
+    run: TrainedRun,
+    scene: Scene,
+    frames: Sequence[Frame],
+    images: Callable[[View], Iterator[Prediction]],
+) -> Array:
+    """Return the PSNR of several images of each view against its photo, if any of it counts."""
     store = ImageStore(scene, max_width=run.record.max_width)
-    model, filtered, values = run.model(period), run.is_filtered, []
+    values = []
     for frame, view in zip(frames, run.frame_views(scene, frames), strict=True):
         photo, mask = store.load(frame), store.load_mask(frame)
         if mask is None or mask.any():
-            images = [model.render(view, run.model_period(period))]
-            images.append(model.render_gaussians(gaussians, view))
-            if filtered:
-                images.append(model.render_gaussians(gaussians, view, plain=True))
-            values.append([psnr(to_bytes(image.rgb), photo, mask) for image in images])
-    if not values:
-        return None
-    own, *exported = np.mean(values, axis=0).tolist()
-    return ExportLoss(len(values), own, exported[-1], exported[0] if filtered else None)
+            values.append([psnr(to_bytes(image.rgb), photo, mask) for image in images(view)])
+    return np.array(values)
 
 
 def _frames(scene: Scene, split: Literal["train", "test"], period: float) -> tuple[Frame, ...]:
@@ -181,12 +198,17 @@ def _adapted(
     plain = Prepared(after.transformed(training_from_local.inverse()), filtered.offset, False)
     if viewers == "plain":
         return plain
+
+    def images(view: View) -> Iterator[Prediction]:
+        yield model.render_gaussians(before, view)
+        yield model.render_gaussians(after, view, plain=True)
+
     judged = frames[:: -(-len(frames) // JUDGED_VIEWS) or 1]
-    with_filter = measure_loss(run, scene, period, before, judged)
-    without = measure_loss(run, scene, period, after, judged)
-    if with_filter is None or without is None or with_filter.filtered is None:
+    values = _psnr(run, scene, judged, images)
+    if not len(values):
         return plain
-    return plain if with_filter.filtered - without.plain < LIMIT_DB else filtered
+    with_filter, without = values.mean(axis=0)
+    return plain if with_filter - without < LIMIT_DB else filtered
 
 
 def _comments(
