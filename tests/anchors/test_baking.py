@@ -76,6 +76,19 @@ def test_new_views_are_near_the_model(heads, one_colour, least):
     assert found[0] < one_colour and found[1] > least, found
 
 
+def test_large_views_give_what_small_ones_do():
+    """Weights come from images of about 320 x 240 pixels, those of colours and shapes alike."""
+    model = make_model(HEADS)
+    large = [
+        View(v.K * [[20], [20], [1]], 20 * v.width, 20 * v.height, v.cam_from_world)
+        for v in ring(30)
+    ]
+    clouds = [bake(model, WEIGHTS, views) for views in (large, ring(30))]
+    views = ring(7, phase=0.05)
+    found = [np.mean([psnr(baked(c, v), decoded(model, v)) for v in views]) for c in clouds]
+    assert found[0] > found[1] - 0.5, found
+
+
 def test_what_no_view_shows_is_left_out():
     model = make_model(())
     views = ring(12)

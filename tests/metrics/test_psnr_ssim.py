@@ -85,6 +85,13 @@ def test_ssim_valid_is_that_of_skimage(seed, noise):
     assert ssim_valid(image, reference) == pytest.approx(skimage_ssim(image, reference), abs=1e-12)
 
 
+def test_ssim_of_tall_images_has_no_seams():
+    """More rows than are computed at a time."""
+    image, reference = pair(shape=(150, 20, 3))
+    assert ssim_valid(image, reference) == pytest.approx(skimage_ssim(image, reference), abs=1e-12)
+    assert ssim(image, reference) == pytest.approx(zero_padded_ssim(image, reference), abs=1e-12)
+
+
 def test_ssim_golden_value():
     # scikit-image 0.26.0 with the arguments above, on pair(0).
     image, reference = pair()
