@@ -27,6 +27,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
 }
 """Groups of parameters: name to the shape of one row."""
 
+_MAX_EXPONENT = 88.0  # Its exponential is finite in float32
 MIN_SPACING = math.sqrt(1e-7)
 """Smallest initial scale, in training units, however close the points are."""
 
@@ -107,11 +108,15 @@ def logit(probability: float) -> float:
 
 
 class _Exp(torch.autograd.Function):
-    """``torch.exp`` whose bits do not depend on how its rows are shared among threads."""
+    """``torch.exp`` whose bits do not depend on how its rows are shared among threads.
+
+    It ends at the largest numbers of float32. An infinite scale would turn the gradient of a
+    Gaussian that is not drawn, 0, into nan, and with it that of the whole step.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = exp(x.detach())
+        y = exp(x.detach().clamp(max=_MAX_EXPONENT))
         ctx.save_for_backward(y)
         return y
 
@@ -138,7 +143,7 @@ class _Sigmoid(torch.autograd.Function):
 
 
 def scales_of(log_scales: Tensor) -> Tensor:
-    """Standard deviations in units of the training frame. [N, 3]"""
+    """Standard deviations in units of the training frame, finite where logarithms are. [N, 3]"""
     return _Exp.apply(log_scales)
 
 

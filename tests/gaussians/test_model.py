@@ -45,6 +45,15 @@ def test_no_points_is_an_error(points):
         initialise(empty, opacity=0.1)
 
 
+def test_a_scale_beyond_all_numbers_spoils_no_step():
+    """A field that deforms Gaussians can send one there; it is not drawn, its gradient is 0."""
+    logarithms = torch.tensor([0.0, 88.0, 200.0, float("inf"), float("nan")], requires_grad=True)
+    scales = scales_of(logarithms)
+    assert scales[:4].isfinite().all() and scales[4].isnan()
+    scales[:4].backward(torch.zeros(4))
+    assert (logarithms.grad[:4] == 0).all()
+
+
 @pytest.mark.parametrize("function", [scales_of, opacities_of])
 def test_gradients_of_the_activations(function):
     x = torch.randn(20, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
