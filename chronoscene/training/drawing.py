@@ -125,7 +125,7 @@ def draw_in_training(
         near_plane=config.near_plane,
         antialiased=config.antialiased,
         absgrad=config.absgrad,
-        # A scale beyond all numbers shows in the gradients; one such step ends no training.
+        # What is not finite shows in the gradients; one such step ends no training.
         check_finite=False,
     )
 

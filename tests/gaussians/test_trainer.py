@@ -156,11 +156,23 @@ def test_an_empty_step_changes_nothing_but_the_schedule_goes_on():
     assert opacities_of(logits).max() < 0.0101
 
 
-def test_a_scale_beyond_all_numbers_is_a_step_that_is_not_finite():
+def test_a_gaussian_with_a_scale_beyond_all_numbers_is_not_drawn_and_stops_no_other():
     method = GaussianSplatting(SHORT)
     method.setup(toy_scene(), seed=0, device="cpu")
     with torch.no_grad():
         method.model.parameters["log_scales"][7] = 200.0
+    before = method.model.parameters["means"].detach().clone()
+    assert method.step(0, 0.0).skipped is None
+    moved = (method.model.parameters["means"] != before).any(1)
+    assert moved.sum() > 10 and not moved[7]
+    assert np.isfinite(method.render(toy_scene().views[0], 0).rgb).all()
+
+
+def test_a_number_that_is_none_is_a_step_that_is_not_finite():
+    method = GaussianSplatting(SHORT)
+    method.setup(toy_scene(), seed=0, device="cpu")
+    with torch.no_grad():
+        method.model.parameters["log_scales"][7] = torch.nan
     before = method.model.parameters["means"].detach().clone()
     assert method.step(0, 0.0).skipped == "not finite"
     assert torch.equal(method.model.parameters["means"], before)
