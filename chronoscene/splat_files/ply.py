@@ -59,7 +59,7 @@ def with_comments(data: bytes, comments: Sequence[str]) -> bytes:
 
 def decode(data: bytes) -> GaussianCloud:
     """Read what `encode` made."""
-    # plyfile reads number by number what is not a file on the disk: a minute for 100,000 Gaussians.
+    # plyfile reads what is not a file on the disk number by number.
     begin = data.index(_END) + len(_END)
     table = np.frombuffer(data, "<f4", offset=begin).reshape(-1, len(NAMES))
 
