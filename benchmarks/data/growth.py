@@ -58,7 +58,7 @@ class Case:
     """Folder of its runs, and name of its figures."""
     scene: Path
     options: tuple[str, ...] = ()
-    """Of ``bench``, beside those of all cases."""
+    """Options of ``bench``, beside those of all cases."""
 
 
 def make_scene(folder: Path, photos: int, points: int) -> None:

@@ -9,6 +9,7 @@ during a training stays on the device of the training.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
@@ -25,6 +26,7 @@ from chronoscene.training.points import rms_spacing
 
 COARSER = 1.02
 """Ratio of the voxel edges that are tried where a cloud would have too many anchors."""
+_POWERS = 4096  # Powers of it that are tried: the last is 1e35
 MIN_DISTANCE = 1e-7
 """Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""
 
@@ -120,13 +122,8 @@ def initial_anchors(
             keys = np.sort(pack_cells(cell_indices(offsets, size * COARSER**exponent)).numpy())
             return bool(np.count_nonzero(np.diff(keys)) < limit)
 
-        low, high = -1, 0  # between what is too fine and what fits
-        while not fits(high):
-            low, high = high, 2 * high + 16
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if fits(middle) else (middle, high)
-        size *= COARSER**high
+        if not fits(0):
+            size *= COARSER ** bisect_left(range(_POWERS), True, key=fits)
     return voxelize(points, size, origin), size
 
 

@@ -19,7 +19,7 @@ from chronoscene.errors import ShapeError
 
 WINDOW = 11  # Taps of the SSIM window per axis
 SIGMA = 1.5  # Standard deviation of the SSIM window in pixels
-_ROWS = 48  # Of a map of SSIM that are computed at a time
+_ROWS = 48  # Rows of a map of SSIM that are computed at a time
 C1, C2 = 0.01**2, 0.03**2
 """Stabilisers of SSIM for data range 1 (Wang et al. 2004)."""
 

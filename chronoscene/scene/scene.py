@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -187,3 +188,14 @@ class Scene:
         """
         assert [f.name for f in frames] == [f.name for f in self.frames]
         return replace(self, frames=tuple(frames))
+
+
+def spread(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:
+    """Choose about so many frames, evenly in each period, at least one."""
+    periods = sorted({frame.period for frame in frames})
+    chosen: list[Frame] = []
+    for period in periods:
+        own = [frame for frame in frames if frame.period == period]
+        number = min(len(own), math.ceil(count / len(periods)))
+        chosen += (own[i * len(own) // number] for i in range(number))
+    return tuple(chosen)

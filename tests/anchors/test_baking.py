@@ -77,7 +77,7 @@ def test_new_views_are_near_the_model(heads, one_colour, least):
 
 
 def test_large_views_give_what_small_ones_do():
-    """Weights come from images of about 320 x 240 pixels, those of colours and shapes alike."""
+    """Weights come from images of about 320 x 240 pixels, whatever the size of the views."""
     model = make_model(HEADS)
     large = [
         View(v.K * [[20], [20], [1]], 20 * v.width, 20 * v.height, v.cam_from_world)

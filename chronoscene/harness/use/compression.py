@@ -11,10 +11,9 @@ bisection, so that the PSNR of training views falls by no more than the user all
 from __future__ import annotations
 
 import json
-import math
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,6 +51,7 @@ from chronoscene.methods import Method
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.metrics.registry import make_scorers
 from chronoscene.scene import Frame, Scene
+from chronoscene.scene.scene import spread
 
 POSITIONS = ("anchors", "means")
 """Names of the tensor of positions."""
@@ -285,17 +285,6 @@ def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, runs:
     }
     truth = ground_truth_folder(runs, run.record.scene)
     score_run(run.folder, run.record.model_copy(update=changed), truth, make_scorers())
-
-
-def spread(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:
-    """Choose about so many frames, evenly in each period, at least one."""
-    periods = sorted({frame.period for frame in frames})
-    chosen: list[Frame] = []
-    for period in periods:
-        own = [frame for frame in frames if frame.period == period]
-        number = min(len(own), math.ceil(count / len(periods)))
-        chosen += (own[i * len(own) // number] for i in range(number))
-    return tuple(chosen)
 
 
 def _rows(tensor: NDArray[Any]) -> NDArray[Any]:

@@ -16,10 +16,11 @@ from chronoscene.harness.files.predictions import load_image, read_manifest, to_
 from chronoscene.harness.files.records import read_run, run_folders
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.use import compression
-from chronoscene.harness.use.compression import compress_run, spread
+from chronoscene.harness.use.compression import compress_run
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.images.store import ImageStore
 from chronoscene.metrics.psnr_ssim import psnr
+from chronoscene.scene.scene import spread
 
 
 def compress(folder, *options):
