@@ -25,6 +25,7 @@ from chronoscene.compression.file import TENSOR_FILE as TENSOR_FILE
 from chronoscene.errors import CheckpointError, ShapeError
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import replacing, sha256_of, write_text_atomic
+from chronoscene.io.wording import shown
 
 TRAINING = "training"
 """Stem of the files that hold a training."""
@@ -129,7 +130,7 @@ def check_finite(folder: Path, tensors: Mapping[str, Tensor]) -> None:
         raise _refusal(
             folder,
             "finite numbers in all tensors of the model",
-            f"others in {', '.join(wrong)}",
+            f"others in {shown(wrong)}",
             f"{DAMAGED}, with lower learning rates if the training gave it",
         )
 

@@ -86,7 +86,7 @@ def test_a_model_that_is_not_finite_is_refused(tmp_path: Path) -> None:
     with torch.no_grad():
         method.network.params["color.0"][0, 0] = float("nan")
     method.save(tmp_path)
-    with pytest.raises(CheckpointError, match=r"finite numbers .* others in color\.0"):
+    with pytest.raises(CheckpointError, match=r"finite numbers .* others in 'color\.0"):
         type(method)(method.config).load(tmp_path, device="cpu")
 
 

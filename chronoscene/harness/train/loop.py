@@ -18,6 +18,7 @@ from chronoscene.harness.plan.parts import Part
 from chronoscene.harness.plan.stop import StopRule
 from chronoscene.harness.train.checkpoints import Checkpoints, LoopState
 from chronoscene.harness.train.checks import check_prediction, check_size, check_step
+from chronoscene.io.wording import shown
 from chronoscene.methods import Method, Prediction, StepReport
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame
@@ -224,7 +225,7 @@ def _was_finite(report: StepReport, state: LoopState) -> bool:
 
 
 def _diverged(report: StepReport, part: Part, last_good: int, reached: int) -> TrainingError:
-    todo, names = _REMEDY, ", ".join(report.not_finite)
+    todo, names = _REMEDY, shown(report.not_finite)
     if report.skipped:
         todo = f"the model of iteration {last_good} is kept in checkpoint; {todo}"
     return (DivergedError if report.skipped else TrainingError)(

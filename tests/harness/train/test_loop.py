@@ -230,7 +230,7 @@ def test_only_a_run_of_steps_that_are_not_finite_ends_the_training(part):
     trained = run(reporting(often), part, StopRule(400, None))
     assert trained.skipped_steps == len(often)
     message = "iteration 57: expected a finite loss and finite gradients, found 50 steps in a row "
-    message += "without, the last one in means; "
+    message += "without, the last one in 'means'; "
     with pytest.raises(DivergedError, match=f"{message}.* model of iteration 7 is kept"):
         run(reporting(range(7, 400)), part, StopRule(400, None))
 
