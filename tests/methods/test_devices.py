@@ -37,6 +37,8 @@ from chronoscene.methods import (
 from chronoscene.training import devices
 
 STEPS = 3
+TRAINED = PAUSE + 12
+"""Steps of the trainings that go from one device to another."""
 EPS = 1e-4
 """Of Adam, where trainings are compared."""
 LOSS_TOLERANCE = {"cpu": 1e-6, "cuda": 1e-4}
@@ -50,7 +52,7 @@ QUESTIONS = 3
 fields: how many samples there are, how many are seen; and how the step went."""
 MORE_QUESTIONS = {"ha-nerf": 1, "ha-nerf-t": 1}
 """The photos that have been drawn have to be encoded."""
-SMALL_FIELD = {"levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
+SMALL_FIELD = {"samples": 8192, "levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
 """Fields in plain torch are slow on a CPU."""
 
 
@@ -142,7 +144,7 @@ def training(compiled: Compiled, device: str, tmp_path_factory: pytest.TempPathF
     if device not in compiled.trainings:
         method, saved = compiled.method(device), tmp_path_factory.mktemp("saved")
         reports = []
-        for i in range(tiny_training.STEPS):
+        for i in range(TRAINED):
             if i == PAUSE and compiled.spec.resumable:
                 method.save_training(saved)
             reports.append(method.step(i, i / tiny_training.STEPS))

@@ -9,7 +9,7 @@ from chronoscene.training.photometric import ssim_torch
 pytestmark = MARKS
 
 
-@pytest.mark.parametrize("size", [(13, 7), (40, 190), (1, 1), (3, 171)])
+@pytest.mark.parametrize("size", [(13, 7), (1, 1), (3, 530)])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_loss_and_gradient_are_those_of_plain_torch(
     size: tuple[int, int], dtype: torch.dtype
@@ -30,6 +30,6 @@ def test_loss_and_gradient_are_those_of_plain_torch(
 
 
 def test_equal_images_have_no_loss() -> None:
-    image = torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(1)).to(DEVICE)
+    image = torch.rand(12, 20, 3, generator=torch.Generator().manual_seed(1)).to(DEVICE)
     value, gradient = gpu_kernels("training.photometric.ssim_gpu").l1_ssim(image, image, (0.8, 0.2))
     assert value == 0 and not gradient.any()
