@@ -52,8 +52,17 @@ QUESTIONS = 3
 fields: how many samples there are, how many are seen; and how the step went."""
 MORE_QUESTIONS = {"ha-nerf": 1, "ha-nerf-t": 1}
 """The photos that have been drawn have to be encoded."""
-SMALL_FIELD = {"samples": 8192, "levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
+SMALL_FIELD = {
+    "samples": 8192,
+    "levels": 4,
+    "log2_rows": 12,
+    "finest": 64,
+    "hidden": 16,
+    "cells": 16,
+}
 """Fields in plain torch are slow on a CPU."""
+SAME_NETWORKS = {"nerf-w", "ha-nerf", "clnerf", "meil-nerf"}
+"""Fields with the networks of another one here."""
 
 
 @dataclass
@@ -81,7 +90,12 @@ class Compiled:
 
 
 @pytest.fixture(
-    scope="module", params=[n for n in method_names() if "cuda" in load_spec(n).devices]
+    scope="module",
+    params=[
+        pytest.param(name, marks=[pytest.mark.slow] if name in SAME_NETWORKS else [])
+        for name in method_names()
+        if "cuda" in load_spec(name).devices
+    ],
 )
 def compiled(request: pytest.FixtureRequest) -> Compiled:
     spec = load_spec(request.param)
