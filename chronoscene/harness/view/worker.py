@@ -20,6 +20,7 @@ UPDATES = 20
 """Pictures a second while something moves."""
 SHARE = 0.8  # Of that time in which a picture is drawn; sending takes the rest
 FULL, LEAST = 1920 * 1080, 96 * 72  # Most and fewest pixels of a picture
+OTHER_SIZE = 2  # Ratio of pixels from which two pictures tell what pixels take
 GROWTH = 4  # From each picture at rest to the next, so that a movement never waits long
 REST, MOVING = 0.15, 0.5
 """Seconds after a request from which its picture rests, and in which its viewer is moving."""
@@ -32,14 +33,39 @@ Draw = Callable[[int], None]
 
 @dataclass
 class Resolution:
-    """Number of pixels that can be drawn in time."""
+    """Number of pixels that can be drawn in time.
+
+    Methods that decode a scene for each view take time for that however small the picture is. It is
+    found by pictures of other sizes. Where it is most of the time that there is, fewer pixels gain
+    little, and pixels may take a third of that time again.
+    """
 
     pixels: float = 320 * 240
+    fixed: float = 0.0
+    """Seconds that no number of pixels saves."""
+    compared: tuple[float, float] | None = None
+    """Pixels and seconds of an earlier picture of another size."""
 
-    def learn(self, seconds: float, moving: int = 1) -> None:
+    def observe(self, pixels: float, seconds: float) -> None:
+        """Learn from a picture what it takes without pixels."""
+        self.fixed = min(self.fixed, seconds)
+        before, took = self.compared or (pixels, seconds)
+        if max(pixels, before) > OTHER_SIZE * min(pixels, before):
+            slope = max(0.0, (seconds - took) / (pixels - before))
+            self.fixed = max(0.0, seconds - slope * pixels)
+            self.compared = (pixels, seconds)
+        elif self.compared is None:
+            self.compared = (pixels, seconds)
+
+    def rest(self) -> None:
+        """Trust less in what was found, since another model may be shown next."""
+        self.fixed /= 2
+
+    def adapt(self, seconds: float, moving: int = 1) -> None:
         """Adapt to the time that a picture took, where so many viewers share the time."""
         wanted = SHARE / UPDATES / max(1, moving)
-        factor = math.sqrt(wanted / max(seconds, 1e-6))  # half of the way: times are noisy
+        wanted = max(wanted - self.fixed, self.fixed / 3)
+        factor = math.sqrt(wanted / max(seconds - self.fixed, 1e-6))  # half of the way
         self.pixels = min(max(self.pixels * min(max(factor, 0.6), 1.3), LEAST), FULL)
 
 
@@ -128,8 +154,12 @@ class RenderWorker:
         with self._drawing:
             draw(pixels)
         with self._changed:
+            seconds = time.monotonic() - seat.served
+            seat.resolution.observe(pixels, seconds)
             if not drawn:
-                seat.resolution.learn(time.monotonic() - seat.served, moving)
+                seat.resolution.adapt(seconds, moving)
+            elif pixels == full:
+                seat.resolution.rest()
             if seat.draw is draw:
                 seat.drawn = pixels
                 seat.due = seat.asked + REST if pixels < full else math.inf

@@ -25,27 +25,44 @@ def until(found, seconds=5.0):
         time.sleep(0.005)
 
 
+def draw(resolution, fixed, per_pixel, *, moving=1, pictures=40):
+    """Let a picture take so long, time and again; return how many pixels it has in the end."""
+    for _ in range(pictures):
+        seconds = fixed + per_pixel * resolution.pixels
+        resolution.observe(resolution.pixels, seconds)
+        resolution.adapt(seconds, moving)
+    return resolution.pixels
+
+
 @pytest.mark.parametrize("per_pixel", [1e-8, 3e-7, 1e-3])
 def test_pictures_take_the_time_that_there_is(per_pixel):
-    resolution = Resolution()
-    for _ in range(40):
-        resolution.learn(0.004 + per_pixel * resolution.pixels)
     affordable = (SHARE / UPDATES - 0.004) / per_pixel
-    assert resolution.pixels == pytest.approx(min(max(affordable, LEAST), FULL), rel=0.05)
+    expected = pytest.approx(min(max(affordable, LEAST), FULL), rel=0.05)
+    assert draw(Resolution(), 0.004, per_pixel) == expected
+
+
+@pytest.mark.parametrize("fixed", [0.1, 0.3])
+def test_what_takes_its_time_anyway_is_not_drawn_in_tiny_pictures(fixed):
+    """As models with 300,000 and a million anchors do."""
+    assert draw(Resolution(), fixed, 1e-7) == pytest.approx(fixed / 3 / 1e-7, rel=0.05)
+
+
+def test_another_model_is_found_out_after_a_rest():
+    resolution = Resolution()
+    draw(resolution, 0.3, 1e-7)
+    resolution.rest()
+    draw(resolution, 0.0, 3e-7)
+    resolution.rest()
+    assert draw(resolution, 0.0, 3e-7) == pytest.approx(SHARE / UPDATES / 3e-7, rel=0.1)
 
 
 def test_two_that_move_share_the_time():
-    alone, beside = Resolution(), Resolution()
-    for _ in range(40):
-        alone.learn(1e-6 * alone.pixels)
-        beside.learn(1e-6 * beside.pixels, moving=2)
-    assert beside.pixels == pytest.approx(alone.pixels / 2, rel=0.05)
+    alone, beside = draw(Resolution(), 0, 1e-6), draw(Resolution(), 0, 1e-6, moving=2)
+    assert beside == pytest.approx(alone / 2, rel=0.05)
 
 
 def test_one_slow_picture_changes_little():
-    resolution = Resolution()
-    resolution.learn(60.0)
-    assert resolution.pixels == pytest.approx(0.6 * 320 * 240)
+    assert draw(Resolution(), 60.0, 0, pictures=1) == pytest.approx(0.6 * 320 * 240)
 
 
 def test_only_the_newest_request_is_drawn(worker):
