@@ -41,7 +41,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),
     "log_scales": (3,),
     "dyads": (4, 4),
-    "normal": (NUM_BASES, NUM_BASES),
+    "normal": (NUM_BASES * (NUM_BASES + 1) // 2,),  # the lower triangle
     "moments": (NUM_BASES, 3),
 }
 """Shapes of the sums of a Gaussian."""
@@ -112,7 +112,9 @@ class _Sums:
     def _solved(self, at: Tensor) -> tuple[Tensor, ...]:
         """Return means, quaternions, scales, opacities and harmonics."""
         found = {name: values[at] for name, values in self._sums.items()}
-        total, normal = found["total"], found["normal"]
+        total, normal = found["total"], torch.empty(len(at), NUM_BASES, NUM_BASES)
+        row, column = torch.tril_indices(NUM_BASES, NUM_BASES)
+        normal[:, row, column] = normal[:, column, row] = found["normal"]
         diagonal = normal.diagonal(dim1=1, dim2=2)
         diagonal[:, 1:] += RIDGE * total[:, None]
         return (
@@ -136,10 +138,11 @@ def _seen(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tenso
 def _add(rows, weights, values, targets, normal, moments):  # type: ignore[no-untyped-def]
     """Add to the normal equations of each Gaussian; each has one row at most."""
     for n in prange(len(rows)):
-        row = rows[n]
+        row, place = rows[n], 0
         for k in range(values.shape[1]):
             weighted = weights[n] * values[n, k]
-            for other in range(values.shape[1]):
-                normal[row, k, other] += weighted * values[n, other]
+            for other in range(k + 1):
+                normal[row, place + other] += weighted * values[n, other]
+            place += k + 1
             for channel in range(3):
                 moments[row, k, channel] += weighted * targets[n, channel]

@@ -115,11 +115,12 @@ def unite(clouds: Sequence[GaussianCloud]) -> tuple[GaussianCloud, NDArray[np.bo
         members: True where a Gaussian is one of the period. [T, U]
     """
     names = [field.name for field in fields(GaussianCloud)]
-    tables = [
-        np.concatenate([getattr(cloud, name).reshape(len(cloud), -1) for name in names], axis=1)
-        for cloud in clouds
-    ]
-    table = np.concatenate(tables).astype("<f4")
+    table = np.concatenate(
+        [
+            np.concatenate([getattr(cloud, name).reshape(len(cloud), -1) for name in names], axis=1)
+            for cloud in clouds
+        ]
+    ).astype("<f4", copy=False)
     as_bytes = table.view(np.dtype((np.void, table.itemsize * table.shape[1])))[:, 0]
     _, first, inverse = np.unique(as_bytes, return_index=True, return_inverse=True)
     members = np.zeros((len(clouds), len(first)), bool)
