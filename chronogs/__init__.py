@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from chronoscene.anchors import MAIN_OPTIONS, SEARCH
+from chronoscene.anchors import MAIN_OPTIONS, MANY_ANCHORS, SEARCH
 from chronoscene.methods import MethodSpec, Range
 
 _FULL: dict[str, Any] = {
@@ -70,7 +70,7 @@ SPEC = MethodSpec(
         "full": _FULL | {"iterations": 3_000},
         "fast": _SHORT | {"iterations": 1_000, "density_interval": 40},
         "balanced": _SHORT | {"iterations": 3_000},
-        "accurate": _SHORT | {"iterations": 8_000},
+        "accurate": _SHORT | {"iterations": 8_000, **MANY_ANCHORS},
     },
     titles={"full": "ChronoGS, sizes of the paper"},
     resumable=True,

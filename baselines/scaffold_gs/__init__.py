@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from chronoscene.anchors import MAIN_OPTIONS, SEARCH
+from chronoscene.anchors import MAIN_OPTIONS, MANY_ANCHORS, SEARCH
 from chronoscene.methods import MethodSpec, Range
 
 _SHORT: dict[str, Any] = {
@@ -20,7 +20,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "fast": _SHORT | {"iterations": 1_000, "density_interval": 40, "offsets_per_anchor": 5},
     "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
-    "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
+    "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50, **MANY_ANCHORS},
 }
 
 SPEC = MethodSpec(

@@ -19,6 +19,9 @@ MAIN_OPTIONS = (
 )
 """Options shown first for each of these methods, followed by its own."""
 
+MANY_ANCHORS: Mapping[str, int] = {"max_initial_anchors": 300_000, "max_anchors": 600_000}
+"""Limits of the presets ``accurate``; docs/experiments/dataset-scale.md has what they bring."""
+
 SEARCH: Mapping[str, tuple[bool, ...] | Range] = {
     "antialiased": (False, True),
     "offset_lr": Range(0.2, 5.0),
