@@ -61,8 +61,8 @@ SMALL_FIELD = {
     "cells": 16,
 }
 """Fields in plain torch are slow on a CPU."""
-SAME_NETWORKS = {"nerf-w", "ha-nerf", "clnerf", "meil-nerf"}
-"""Fields with the networks of another one here."""
+SAME_NETWORKS = {"nerf-w", "ha-nerf", "meil-nerf"}
+"""Fields whose networks are among those of `nerf-w-t`, `ha-nerf-t` and `clnerf`."""
 
 
 @dataclass

@@ -49,12 +49,11 @@ class Resolution:
     def observe(self, pixels: float, seconds: float) -> None:
         """Learn from a picture what it takes without pixels."""
         self.fixed = min(self.fixed, seconds)
-        before, took = self.compared or (pixels, seconds)
+        self.compared = self.compared or (pixels, seconds)
+        before, took = self.compared
         if max(pixels, before) > OTHER_SIZE * min(pixels, before):
             slope = max(0.0, (seconds - took) / (pixels - before))
             self.fixed = max(0.0, seconds - slope * pixels)
-            self.compared = (pixels, seconds)
-        elif self.compared is None:
             self.compared = (pixels, seconds)
 
     def rest(self) -> None:

@@ -65,6 +65,19 @@ def test_one_slow_picture_changes_little():
     assert draw(Resolution(), 60.0, 0, pictures=1) == pytest.approx(0.6 * 320 * 240)
 
 
+def test_the_worker_learns_what_takes_its_time_anyway(worker):
+    pixels = []
+
+    def decode(size):
+        time.sleep(0.06)
+        pixels.append(size)
+
+    for number in range(1, 13):
+        worker.request("a", decode, SIZE)
+        until(lambda number=number: len(pixels) >= number)
+    assert pixels[2] < pixels[0] < pixels[11]
+
+
 def test_only_the_newest_request_is_drawn(worker):
     begun, go, drawn = threading.Event(), threading.Event(), []
 
