@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 
 from torch import Tensor
 
@@ -69,5 +68,4 @@ class Realtime4DGS(GaussianMethod):
     def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
         """Gaussians that are there at the time."""
         cloud = super().static_gaussians(period, views)
-        alive = cloud.opacities > 0
-        return GaussianCloud(*(getattr(cloud, field.name)[alive] for field in fields(cloud)))
+        return cloud.rows(cloud.opacities > 0)

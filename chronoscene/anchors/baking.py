@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from numba import prange
 from torch import Tensor
@@ -73,11 +74,11 @@ class _Sums:
     def __init__(self, rows: int) -> None:
         self._places = torch.full((rows,), -1)
         self._count = 0
-        self._sums = {name: torch.empty(0, *shape) for name, shape in _SHAPES.items()}
+        self._sums = {name: np.empty((0, *shape), np.float32) for name, shape in _SHAPES.items()}
 
     def add(self, view: View, rows: Tensor, splats: Splats, weights: Tensor) -> None:
         """Add what a view shows, see `_seen`."""
-        at, sums = self._places_of(rows), self._sums
+        at, sums = self._places_of(rows), self._tensors()
         sums["total"][at] += weights
         sums["light"][at] += weights / splats.opacities
         sums["means"][at] = splats.means  # the same in all views
@@ -93,7 +94,7 @@ class _Sums:
     def gaussians(self) -> GaussianCloud:
         """Return the Gaussians that fill enough pixels, in the order of the model."""
         places = self._places[self._places >= 0]
-        kept = places[self._sums["total"][places] > MIN_WEIGHT]
+        kept = places[self._tensors()["total"][places] > MIN_WEIGHT]
         parts = zip(*map(self._solved, kept.split(_AT_A_TIME)), strict=True)
         return GaussianCloud(*(torch.cat(part).contiguous().numpy() for part in parts))
 
@@ -102,16 +103,18 @@ class _Sums:
         new = rows[self._places[rows] < 0]
         self._places[new] = torch.arange(self._count, self._count + len(new))
         self._count += len(new)
-        room = len(self._sums["total"])
-        if self._count > room:
-            more = int(_GROWTH * self._count) - room
-            for name, shape in _SHAPES.items():
-                self._sums[name] = torch.cat([self._sums[name], torch.zeros(more, *shape)])
+        if self._count > len(self._sums["total"]):
+            for values in self._sums.values():  # with zeros, and without a copy where memory allows
+                values.resize(int(_GROWTH * self._count), *values.shape[1:], refcheck=False)
         return self._places[rows]
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Return the sums as tensors, which are valid until these grow."""
+        return {name: torch.from_numpy(values) for name, values in self._sums.items()}
 
     def _solved(self, at: Tensor) -> tuple[Tensor, ...]:
         """Return means, quaternions, scales, opacities and harmonics."""
-        found = {name: values[at] for name, values in self._sums.items()}
+        found = {name: values[at] for name, values in self._tensors().items()}
         total, normal = found["total"], torch.empty(len(at), NUM_BASES, NUM_BASES)
         row, column = torch.tril_indices(NUM_BASES, NUM_BASES)
         normal[:, row, column] = normal[:, column, row] = found["normal"]

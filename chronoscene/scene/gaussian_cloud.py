@@ -39,6 +39,10 @@ class GaussianCloud:
     def __len__(self) -> int:
         return len(self.means)
 
+    def rows(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> GaussianCloud:
+        """Return some of the Gaussians, copied, by flags or indices."""
+        return GaussianCloud(*(getattr(self, field.name)[which] for field in fields(self)))
+
     def tensors(self, device: str = "cpu") -> dict[str, Tensor]:
         """Return the arrays by their names as torch tensors in float32."""
         import torch

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ _SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.f
 """Signs of the harmonics of degree 1 to 3 after the same change of axes. [15]"""
 _SH_STEPS = np.array([8] * 3 + [16] * 12)
 """Multiples that the stored bytes of degree 1 and of the others have. [15]"""
+_AT_A_TIME = 1 << 16  # Gaussians of which harmonics are packed together, so that copies stay small
 _OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
 """The components of a quaternion but the i-th. [4, 3]"""
 
@@ -48,22 +50,27 @@ def encode(cloud: GaussianCloud, *, antialiased: bool) -> bytes:
         cloud: Values outside of the range of the format become its limits.
         antialiased: Whether a viewer is to draw with the filter of Mip-Splatting.
     """
+    # Without a time stamp, equal clouds give equal files.
+    return gzip.compress(encode_plain(cloud, antialiased=antialiased), mtime=0)
+
+
+def encode_plain(cloud: GaussianCloud, *, antialiased: bool) -> bytes:
+    """Make the content of a file, before gzip; see `encode`."""
     fractional_bits = _fractional_bits(cloud.means)
     flags = ANTIALIASED if antialiased else 0
     header = _HEADER.pack(MAGIC, VERSION, len(cloud), SH_DEGREE, fractional_bits, flags, 0)
     fixed = np.rint(cloud.means.astype(np.float64) * _FLIPPED * 2.0**fractional_bits)
     with np.errstate(divide="ignore"):  # a scale of 0 is the smallest one
         log_scales = np.log(cloud.scales)
-    parts = (
+    parts: list[NDArray[Any]] = [
         fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[..., :3],
         _to_byte(cloud.opacities * 255),
         _to_byte(cloud.sh_coeffs[:, 0] * COLOUR_SCALE + 127.5),
         _to_byte((log_scales + 10) * 16),
         _pack_rotations(cloud.quats),
-        _pack_harmonics(cloud.sh_coeffs[:, 1:]),
-    )
-    # Without a time stamp, equal clouds give equal files.
-    return gzip.compress(header + b"".join(part.tobytes() for part in parts), mtime=0)
+        *map(_pack_harmonics, np.array_split(cloud.sh_coeffs[:, 1:], 1 + len(cloud) // _AT_A_TIME)),
+    ]
+    return header + b"".join(part.tobytes() for part in parts)
 
 
 def decode(data: bytes) -> GaussianCloud:

@@ -13,11 +13,18 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import ConfigError
 from chronoscene.scene.gaussian_cloud import GaussianCloud
-from chronoscene.splat_files.spz import encode
+from chronoscene.splat_files.spz import encode_plain
 
 HEADER_BYTES, CENTRE_BYTES = 16, 9  # Of SPZ
 LEAST = 0.02
 """Share of the Gaussians below which a page is refused."""
+MANY, SAMPLED, GENEROUS = 500_000, 16, 1.15
+"""Above so many Gaussians of all periods, one of `SAMPLED` tells what would be too large for
+`GENEROUS` times the room: a small sample is packed less tightly."""
+
+
+_ENDS = [3, 7, 10, 11]
+"""Where the columns of the parts of a `GaussianCloud` end, in one row of 59 values."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,19 +75,15 @@ def fit_gaussians(
         ConfigError: If next to nothing would be left.
     """
     reduction = Reduction()
+    if (total := _count(runs)) > MANY:
+        samples = [[*map(_sample, clouds)] for clouds in runs]
+        reduction = _guess(samples, antialiased, GENEROUS * room * _count(samples) / total)
     while True:
-        packed = [
-            pack([_reduced(cloud, reduction) for cloud in clouds], antialiased=filtered)
-            for clouds, filtered in zip(runs, antialiased, strict=True)
-        ]
-        size = sum(len(each.text) for each in packed)
+        packed = _pack_reduced(runs, antialiased, reduction)
+        size = _size(packed)
         if size <= room:
             return packed, reduction
-        if reduction.degree > 1:
-            reduction = replace(reduction, degree=reduction.degree - 1)
-        else:
-            share = reduction.share * min(0.95, 0.98 * room / size)
-            reduction = replace(reduction, share=share)
+        reduction = _more_reduced(reduction, room / size)
         if reduction.share < LEAST:
             raise ConfigError(
                 "--max-megabytes",
@@ -90,10 +93,55 @@ def fit_gaussians(
             )
 
 
+def _guess(
+    samples: Sequence[Sequence[GaussianCloud]], antialiased: Sequence[bool], room: float
+) -> Reduction:
+    """Return a reduction to begin with: packing millions of Gaussians takes minutes."""
+    reduction = Reduction()
+    while reduction.share == 1:
+        size = _size(_pack_reduced(samples, antialiased, reduction))
+        if size <= room:
+            break
+        reduction = _more_reduced(reduction, room / size)
+    return replace(reduction, share=max(reduction.share, LEAST))
+
+
+def _sample(cloud: GaussianCloud) -> GaussianCloud:
+    """Choose by the centres, so that Gaussians which periods share are in the sample of each."""
+    x, y, z = cloud.means.astype("<f4").view("<u4").T
+    mixed = (x ^ y * np.uint32(0x9E3779B1) ^ z * np.uint32(0x85EBCA77)) * np.uint32(0xC2B2AE3D)
+    return cloud.rows(mixed >> np.uint32(16) & np.uint32(SAMPLED - 1) == 0)
+
+
+def _pack_reduced(
+    runs: Sequence[Sequence[GaussianCloud]], antialiased: Sequence[bool], reduction: Reduction
+) -> list[PackedGaussians]:
+    return [
+        pack([_reduced(cloud, reduction) for cloud in clouds], antialiased=filtered)
+        for clouds, filtered in zip(runs, antialiased, strict=True)
+    ]
+
+
+def _count(runs: Sequence[Sequence[GaussianCloud]]) -> int:
+    return sum(len(cloud) for clouds in runs for cloud in clouds)
+
+
+def _size(packed: Sequence[PackedGaussians]) -> int:
+    return sum(len(each.text) for each in packed)
+
+
+def _more_reduced(reduction: Reduction, fits: float) -> Reduction:
+    """Reduce what fits to this share."""
+    if reduction.degree > 1:
+        return replace(reduction, degree=reduction.degree - 1)
+    return replace(reduction, share=reduction.share * min(0.95, 0.98 * fits))
+
+
 def pack(clouds: Sequence[GaussianCloud], *, antialiased: bool) -> PackedGaussians:
     """Pack the Gaussians of all periods of a run; see `fit_gaussians`."""
     union, members = unite(clouds)
-    spz, repeated = _without_repeated_centres(encode(union, antialiased=antialiased), len(union))
+    plain = encode_plain(union, antialiased=antialiased)
+    spz, repeated = _without_repeated_centres(plain, len(union))
     document = {
         "spz": _base64(gzip.compress(spz, mtime=0)),
         "repeated": _bits(repeated),
@@ -114,24 +162,25 @@ def unite(clouds: Sequence[GaussianCloud]) -> tuple[GaussianCloud, NDArray[np.bo
         union: Sorted, so that Gaussians with equal centres are neighbours. [U]
         members: True where a Gaussian is one of the period. [T, U]
     """
-    names = [field.name for field in fields(GaussianCloud)]
-    table = np.concatenate(
-        [
-            np.concatenate([getattr(cloud, name).reshape(len(cloud), -1) for name in names], axis=1)
-            for cloud in clouds
-        ]
-    ).astype("<f4", copy=False)
-    as_bytes = table.view(np.dtype((np.void, table.itemsize * table.shape[1])))[:, 0]
-    _, first, inverse = np.unique(as_bytes, return_index=True, return_inverse=True)
-    members = np.zeros((len(clouds), len(first)), bool)
-    members[np.repeat(np.arange(len(clouds)), [*map(len, clouds)]), inverse] = True
-    means, quats, scales, opacities, sh = np.split(table[first], [3, 7, 10, 11], axis=1)
+    table = np.empty((sum(map(len, clouds)), 59), "<f4")
+    end = 0
+    for cloud in clouds:
+        rows = table[end : (end := end + len(cloud))]
+        for part, field in zip(np.split(rows, _ENDS, axis=1), fields(cloud), strict=True):
+            part[:] = getattr(cloud, field.name).reshape(part.shape)
+    order = np.argsort(table.view((np.void, 59 * 4))[:, 0], kind="stable")
+    table = table[order]
+    bits, first = table.view("<u4"), np.ones(len(table), bool)
+    first[1:] = (bits[1:] != bits[:-1]).any(axis=1)
+    members = np.zeros((len(clouds), int(first.sum())), bool)
+    periods = np.repeat(np.arange(len(clouds)), [*map(len, clouds)])
+    members[periods[order], first.cumsum() - 1] = True
+    means, quats, scales, opacities, sh = np.split(table[first], _ENDS, axis=1)
     return GaussianCloud(means, quats, scales, opacities[:, 0], sh.reshape(-1, 16, 3)), members
 
 
-def _without_repeated_centres(data: bytes, count: int) -> tuple[bytes, NDArray[np.bool_]]:
-    """Unpack SPZ and drop centres that equal the one before; say which. [N]"""
-    raw = gzip.decompress(data)
+def _without_repeated_centres(raw: bytes, count: int) -> tuple[bytes, NDArray[np.bool_]]:
+    """Drop centres of plain SPZ that equal the one before; say which. [N]"""
     end = HEADER_BYTES + CENTRE_BYTES * count
     centres = np.frombuffer(raw[HEADER_BYTES:end], np.uint8).reshape(count, CENTRE_BYTES)
     repeated = np.zeros(count, bool)
@@ -145,12 +194,9 @@ def _reduced(cloud: GaussianCloud, reduction: Reduction) -> GaussianCloud:
     largest = np.sort(cloud.scales, axis=1)[:, 1:]
     contribution = cloud.opacities * largest.prod(axis=1)
     number = int(np.ceil(reduction.share * len(cloud)))
-    kept = np.sort(np.argsort(-contribution, kind="stable")[:number])
-    sh = cloud.sh_coeffs[kept]
-    sh[:, (reduction.degree + 1) ** 2 :] = 0
-    return GaussianCloud(
-        cloud.means[kept], cloud.quats[kept], cloud.scales[kept], cloud.opacities[kept], sh
-    )
+    kept = cloud.rows(np.sort(np.argsort(-contribution, kind="stable")[:number]))
+    kept.sh_coeffs[:, (reduction.degree + 1) ** 2 :] = 0
+    return kept
 
 
 def _bits(flags: NDArray[np.bool_]) -> str:

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, ConfigError, DiskFullError, SceneError
 from chronoscene.harness.files.predictions import to_bytes
+from chronoscene.harness.use import page_gaussians
 from chronoscene.harness.use.page import EXTENT
 from chronoscene.harness.use.page_gaussians import Reduction, fit_gaussians, pack, unite
 from chronoscene.harness.use.trained_run import open_run
@@ -74,6 +75,28 @@ def test_what_goes_first_where_room_is_short():
     assert len(packed[0].text) <= 0.2 * size and fewer.degree == 1 and fewer.share < 1
     with pytest.raises(ConfigError, match=r"--max-megabytes: expected room .*allow more"):
         fit_gaussians(clouds, [True], 0)
+
+
+def test_a_sample_tells_what_is_too_large(monkeypatch):
+    first, second = cloud(20_000), cloud(20_000)
+    second.sh_coeffs[10_000:] *= -1
+    runs = [[first, second]]
+    packed_clouds = []
+
+    def count(clouds):
+        packed_clouds.append(len(clouds[0]))
+        return unite(clouds)
+
+    monkeypatch.setattr(page_gaussians, "unite", count)
+    for room in (1.1e6, 4e5):
+        monkeypatch.setattr(page_gaussians, "MANY", 40_000)
+        _, tried = fit_gaussians(runs, [True], room)
+        monkeypatch.setattr(page_gaussians, "MANY", 39_999)
+        packed_clouds.clear()
+        packed, guessed = fit_gaussians(runs, [True], room)
+        assert len(packed[0].text) <= room and guessed.degree == tried.degree
+        assert guessed.share == pytest.approx(tried.share, rel=0.05)
+        assert sum(number > 2_000 for number in packed_clouds) <= 3
 
 
 def test_the_folder(trained, tmp_path):
