@@ -24,7 +24,7 @@ SCENE := $(DEMO)/demo
 DEMO_METHODS := chronogs,scaffold-gs,3dgs,4dgs
 DEMO_BUDGET := 90s
 
-.PHONY: demo leaderboard test lint mutants clean distclean
+.PHONY: demo leaderboard test gaussian-kernels other-kernels lint mutants clean distclean
 
 demo: $(DEMO)/.made
 	$(BIN)/chronoscene validate $(SCENE)
@@ -51,8 +51,16 @@ leaderboard: $(READY)
 	rm -rf $(SITE)
 	$(BIN)/chronoscene leaderboard leaderboard/entries/measured --out $(SITE) $(RUNS:%=--runs %)
 
-test: lint
+test: $(READY)
+	@$(MAKE) --no-print-directory --jobs=2 lint gaussian-kernels other-kernels
 	$(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
+
+# Each process of the tests would compile them.
+gaussian-kernels: $(READY)
+	$(BIN)/python tests/compile_kernels.py chronogs 3dgs 4dgs realtime4dgs gs-w
+
+other-kernels: $(READY)
+	$(BIN)/python tests/compile_kernels.py --scene neusc
 
 mutants: $(READY)
 	$(BIN)/python tests/mutants/run.py

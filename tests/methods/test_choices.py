@@ -42,7 +42,11 @@ def choices(kind: Any) -> Iterator[Any]:
 
 
 def cases() -> Iterator[Any]:
-    """Each choice that preset ``fast`` does not have, and 0 for each number."""
+    """Each choice that preset ``fast`` does not have, and 0 for each number.
+
+    Choices that methods inherit are tested by default for the first of them.
+    """
+    seen = set()
     for name in method_names():
         spec = load_spec(name)
         usual = build_config(spec, preset="fast")
@@ -50,7 +54,12 @@ def cases() -> Iterator[Any]:
             now = getattr(usual, option)
             for value in choices(kind):
                 if value != now:
-                    yield pytest.param(name, option, value, id=f"{name}-{option}={value}")
+                    owner = next(c for c in type(usual).__mro__ if option in c.__annotations__)
+                    marks = [pytest.mark.slow] if (owner, option, value) in seen else []
+                    seen.add((owner, option, value))
+                    yield pytest.param(
+                        name, option, value, id=f"{name}-{option}={value}", marks=marks
+                    )
             if isinstance(now, float) and now:
                 marks = pytest.mark.slow
                 yield pytest.param(name, option, 0.0, id=f"{name}-{option}=0", marks=marks)

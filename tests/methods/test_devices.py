@@ -53,7 +53,7 @@ fields: how many samples there are, how many are seen; and how the step went."""
 MORE_QUESTIONS = {"ha-nerf": 1, "ha-nerf-t": 1}
 """The photos that have been drawn have to be encoded."""
 SMALL_FIELD = {
-    "samples": 8192,
+    "samples": 4096,
     "levels": 4,
     "log2_rows": 12,
     "finest": 64,
@@ -61,7 +61,7 @@ SMALL_FIELD = {
     "cells": 16,
 }
 """Fields in plain torch are slow on a CPU."""
-SAME_NETWORKS = {"nerf-w", "ha-nerf", "meil-nerf"}
+SAME_NETWORKS = {"nerf-t", "nerf-w", "ha-nerf", "meil-nerf"}
 """Fields whose networks are among those of `nerf-w-t`, `ha-nerf-t` and `clnerf`."""
 
 

@@ -15,10 +15,19 @@ from chronoscene.methods import import_object, load_spec, method_names
 
 SMALL_FIELD = {"levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
 STEPS = 12
+QUICK = [name for name in method_names() if not load_spec(name).mixes_views]
+ALL_NETWORKS = {"clnerf", "ha-nerf-t", "neusc"}
+"""Fields that have the networks of the others between them."""
 
 
 @pytest.mark.filterwarnings("ignore:.*deterministic")
-@pytest.mark.parametrize("name", method_names())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=() if n in QUICK or n in ALL_NETWORKS else pytest.mark.slow)
+        for n in method_names()
+    ],
+)
 def test_no_method_reads_memory_that_nobody_wrote(name: str) -> None:
     spec = load_spec(name)
     data = make_training_set(tiny_training.periods_for(spec))

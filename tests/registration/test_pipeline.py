@@ -137,6 +137,7 @@ def test_features_of_a_database_are_used_and_named(
     assert certificate["features"].startswith("features of features.db (COLMAP, SHA-256 ")
 
 
+@pytest.mark.slow
 def test_route_separate(
     joint: tuple[Path, Registered], captures: Path, truth: Scene, tmp_path: Path
 ) -> None:

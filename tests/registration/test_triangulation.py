@@ -91,6 +91,7 @@ def test_points_lie_on_the_true_surfaces(done: tuple[Path, Triangulated], truth:
     assert np.quantile(error, 0.9) < 0.05  # edges of roofs have two depths
 
 
+@pytest.mark.slow
 def test_poses_of_other_photos_are_refused(bare: Path, tmp_path: Path) -> None:
     scene = read_scene(bare)
     turned = scene.frames[1:] + scene.frames[:1]

@@ -105,6 +105,7 @@ def test_colours_are_means_of_the_observed_pixels(made, observations) -> None:  
         np.testing.assert_allclose(made.scene.points.rgb[point], mean, atol=0.51)
 
 
+@pytest.mark.slow
 def test_noise_is_reported_as_error(tmp_path) -> None:  # type: ignore[no-untyped-def]
     from chronoscene.formats import chronoscene as scene_format
     from chronoscene.synth import generate

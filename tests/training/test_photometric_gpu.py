@@ -9,7 +9,7 @@ from chronoscene.training.photometric import ssim_torch
 pytestmark = MARKS
 
 
-@pytest.mark.parametrize("size", [(13, 7), (1, 1), (3, 530)])
+@pytest.mark.parametrize("size", [(13, 7), (1, 1), pytest.param((3, 530), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_loss_and_gradient_are_those_of_plain_torch(
     size: tuple[int, int], dtype: torch.dtype

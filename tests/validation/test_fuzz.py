@@ -134,7 +134,7 @@ NAMES = st.one_of(
 )
 
 
-@settings(max_examples=160, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, suppress_health_check=list(HealthCheck))
 @given(st.lists(st.tuples(NAMES, st.one_of(st.integers(), st.text(max_size=5)))), st.lists(NAMES))
 def test_any_split_and_test_list(fuzzed, lines, tests):
     split = "\n".join(f"{name} {period}" for name, period in lines)

@@ -93,8 +93,14 @@ def call(
     return run
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("name", USED)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        pytest.param(name, method, marks=() if method == "nerf-t" else pytest.mark.slow)
+        for name in USED
+        for method in METHODS
+    ],
+)
 def test_a_command_uses_a_field(
     name: str, method: str, call: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -535,6 +535,7 @@ def test_another_way_to_compute_features_does_the_stage_again(
     assert "features" in matched(captures)[2].computed
 
 
+@pytest.mark.slow
 def test_the_command_goes_on_from_the_run_before(
     captures: Path, photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -154,6 +154,7 @@ def test_nothing_in_common_is_a_fail_that_says_so() -> None:
     assert verdict.pairs == {(0, 1): None}
 
 
+@pytest.mark.slow
 def test_a_chain_of_good_pairs_is_good() -> None:
     """Periods 0 and 3 share nothing, but each is linked to the next."""
     settings = CaseSettings(

@@ -69,6 +69,7 @@ def found(arguments: dict[str, Any]) -> tuple[float, float]:
 LENS = (-0.12, 0.09, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_stated_focal_length_is_held_where_flat_ground_leaves_it_open(
     tmp_path: Path, write_database: Callable[..., Any]
 ) -> None:

@@ -76,6 +76,7 @@ def test_lights_and_dates_are_all_different(seed: int, periods: int) -> None:
     assert all(5 < light.elevation < 75 for light in lights)
 
 
+@pytest.mark.slow
 def test_the_light_can_stay() -> None:
     world = make_world(preset("tiny", periods=4, same_light=True))
     assert world.lights == make_lights(0, 1) * 4
@@ -127,6 +128,7 @@ def test_street_views_walk_between_the_houses() -> None:
         assert (renderer.surfaces.nearest(eyes)[0] > 0.7).all()
 
 
+@pytest.mark.slow
 def test_rebuilt_blocks_leave_the_streets() -> None:
     plain = make_world(preset("tiny"))
     city = make_world(preset("tiny", rebuilt=1.0))

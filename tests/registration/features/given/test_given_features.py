@@ -68,6 +68,7 @@ def test_features_and_matches_survive_whole(
     assert len(list(files[0].parent.iterdir())) == len(files)  # nothing appeared beside them
 
 
+@pytest.mark.slow
 def test_a_changed_file_runs_again_what_depends_on_it(
     captures: Path, hloc: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -91,6 +92,7 @@ def test_a_changed_file_runs_again_what_depends_on_it(
     assert removed and sum(map(len, stored(tmp_path / "work")[1].values())) == before - removed
 
 
+@pytest.mark.slow
 def test_a_photo_that_a_file_lacks_is_not_extracted_again(
     captures: Path, hloc: tuple[Path, Path], features: dict[str, ImageFeatures], tmp_path: Path
 ) -> None:
