@@ -57,10 +57,10 @@ test: $(READY)
 
 # Each process of the tests would compile them.
 gaussian-kernels: $(READY)
-	$(BIN)/python tests/compile_kernels.py chronogs 3dgs 4dgs realtime4dgs gs-w
+	$(BIN)/python -m tests.compile_kernels chronogs 3dgs 4dgs realtime4dgs gs-w
 
 other-kernels: $(READY)
-	$(BIN)/python tests/compile_kernels.py --scene neusc
+	$(BIN)/python -m tests.compile_kernels --scene neusc
 
 mutants: $(READY)
 	$(BIN)/python tests/mutants/run.py

@@ -1,6 +1,6 @@
 """Compiles the kernels of methods before the tests: their processes would each do it.
 
-python tests/compile_kernels.py [--scene] METHOD...
+python -m tests.compile_kernels [--scene] METHOD...
 """
 
 import argparse

@@ -190,7 +190,7 @@ class Scene:
         return replace(self, frames=tuple(frames))
 
 
-def spread(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:
+def spread_frames(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:
     """Choose about so many frames, evenly in each period, at least one."""
     periods = sorted({frame.period for frame in frames})
     chosen: list[Frame] = []

@@ -51,14 +51,14 @@ from chronoscene.methods import Method
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.metrics.registry import make_scorers
 from chronoscene.scene import Frame, Scene
-from chronoscene.scene.scene import spread
+from chronoscene.scene.scene import spread_frames
 
 POSITIONS = ("anchors", "means")
 """Names of the tensor of positions."""
 MIN_ROWS = 256
 """Tensors with fewer rows are not worth a table of symbols."""
 PROBE_VIEWS, LOSS_VIEWS = 9, 24
-"""Training views on which columns, and the loss, are measured; see `spread`."""
+"""Training views on which columns, and the loss, are measured; see `spread_frames`."""
 PROBE_WIDTH = 400
 """Pixels in a row of the images on which columns are measured, at most."""
 ROUNDS, LEAST = 7, -24.0
@@ -105,7 +105,7 @@ class _SortedModel:
 
     def psnr(self, tensors: Arrays) -> float:
         """Mean PSNR over training views."""
-        frames = spread(self.frames, LOSS_VIEWS)
+        frames = spread_frames(self.frames, LOSS_VIEWS)
         values = []
         for frame, image in zip(frames, self.images(tensors, frames, self.store), strict=True):
             mask = self.store.load_mask(frame)
@@ -241,7 +241,7 @@ def _sensitivity(
     model: _SortedModel, rules: Mapping[str, Columns], log: Log
 ) -> dict[str, NDArray[np.float64]]:
     """Measure k_c of every column, by rounding one after the other."""
-    frames = spread(model.frames, PROBE_VIEWS)
+    frames = spread_frames(model.frames, PROBE_VIEWS)
     plain = model.images(model.tensors, frames, model.small)
     found = {}
     for name, rule in rules.items():

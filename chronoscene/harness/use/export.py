@@ -22,13 +22,13 @@ from chronoscene.scene import Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.orbit import find_up
-from chronoscene.scene.scene import spread
+from chronoscene.scene.scene import spread_frames
 from chronoscene.scene.similarity import Sim3
 
 LIMIT_DB = 0.3
 """PSNR that plain viewers may lose on training views, for them to be the default."""
 JUDGED_VIEWS = 24
-"""Training views of the period by which that is judged, at most; see `spread`."""
+"""Training views of the period by which that is judged, at most; see `spread_frames`."""
 FAR_AWAY = 2_000.0
 """Coordinate of the median camera, in units of the scene, beyond which an offset is subtracted."""
 
@@ -204,7 +204,7 @@ def _adapted(
         yield model.render_gaussians(before, view)
         yield model.render_gaussians(after, view, plain=True)
 
-    values = _psnr(run, scene, spread(frames, JUDGED_VIEWS), images)
+    values = _psnr(run, scene, spread_frames(frames, JUDGED_VIEWS), images)
     if not len(values):
         return plain
     with_filter, without = values.mean(axis=0)

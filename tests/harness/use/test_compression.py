@@ -20,7 +20,7 @@ from chronoscene.harness.use.compression import compress_run
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.images.store import ImageStore
 from chronoscene.metrics.psnr_ssim import psnr
-from chronoscene.scene.scene import spread
+from chronoscene.scene.scene import spread_frames
 
 
 def compress(folder, *options):
@@ -97,9 +97,9 @@ def test_a_damaged_model_is_refused(copied):
 def test_every_period_has_a_view_however_many_there_are(copied):
     frames = open_run(copied("chronogs")).scene().frames
     many = [replace(frames[0], period=i % 40, image_id=i) for i in range(100)]
-    assert [f.period for f in spread(many, 9)] == list(range(40))
-    assert [f.image_id for f in spread(many[:1] * 7, 3)] == [0] * 3
-    assert spread(many[::40], 99) == tuple(many[::40])
+    assert [f.period for f in spread_frames(many, 9)] == list(range(40))
+    assert [f.image_id for f in spread_frames(many[:1] * 7, 3)] == [0] * 3
+    assert spread_frames(many[::40], 99) == tuple(many[::40])
 
 
 def test_the_model_of_a_period_is_judged_by_photos_of_that_period(
