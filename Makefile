@@ -51,9 +51,10 @@ leaderboard: $(READY)
 	rm -rf $(SITE)
 	$(BIN)/chronoscene leaderboard leaderboard/entries/measured --out $(SITE) $(RUNS:%=--runs %)
 
+# Many tests start processes, which read bytecode faster than sources.
 test: $(READY)
 	@$(MAKE) --no-print-directory --jobs=2 lint gaussian-kernels other-kernels
-	$(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
 
 # Each process of the tests would compile them.
 gaussian-kernels: $(READY)

@@ -19,7 +19,7 @@ from chronoscene.kernels import runtime
 
 # How long an example takes is not a property of the code on a machine that others use too. What is
 # drawn is the same in every run, unless --hypothesis-profile=afresh asks for other draws.
-settings.register_profile("fixed", deadline=None, derandomize=True, database=None, max_examples=50)
+settings.register_profile("fixed", deadline=None, derandomize=True, database=None, max_examples=25)
 settings.register_profile("afresh", deadline=None, derandomize=False)
 settings.load_profile("fixed")
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
@@ -153,6 +155,13 @@ def method_names(group: str = ENTRY_POINT_GROUP) -> tuple[str, ...]:
 
 def installed_methods() -> dict[str, EntryPoint]:
     """Return the entry points of all methods, other programs among them, by name."""
+    return dict(_installed_along(tuple(sys.path)))
+
+
+@cache
+def _installed_along(path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """Look through the packages of a module path, which takes as long as reading a small file of
+    each."""
     groups = (PROGRAM_GROUP, ENTRY_POINT_GROUP)
     return {entry.name: entry for group in groups for entry in entry_points(group=group)}
 

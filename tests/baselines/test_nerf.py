@@ -36,10 +36,12 @@ FLAGS = ("time", "appearance", "transient")
 
 
 def combinations() -> Iterator[Any]:
+    """All combinations: those of one method by default."""
     for name in ("nerf-w-t", "neusc", "ha-nerf-t"):
         types = get_type_hints(import_object(load_spec(name).config))
         for values in product(*(get_args(types[flag]) for flag in FLAGS)):
-            yield pytest.param(name, values, id="-".join((name, *values)))
+            marks = () if name == "neusc" else pytest.mark.slow
+            yield pytest.param(name, values, id="-".join((name, *values)), marks=marks)
 
 
 @pytest.mark.parametrize(("name", "values"), tuple(combinations()))

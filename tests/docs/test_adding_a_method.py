@@ -34,9 +34,8 @@ def smaller(text):
     return text
 
 
-@pytest.mark.parametrize(
-    "package", [pytest.param("voxel_field", marks=pytest.mark.slow), "tinted_gaussians"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("package", ["voxel_field", "tinted_gaussians"])
 def test_the_packages_on_the_page_keep_all_rules(package, tmp_path, monkeypatch):
     (tmp_path / package).mkdir()
     for name in (f"{package}/__init__.py", f"{package}/method.py"):

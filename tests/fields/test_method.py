@@ -47,7 +47,10 @@ def saved(method: FieldMethod, folder: Path) -> bytes:
 METHODS = ("clnerf", "cl-nerf", "neusc", "nerf-w", "ha-nerf")
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in ("cl-nerf", "neusc") else pytest.mark.slow) for n in METHODS],
+)
 def test_threads_and_an_interruption_change_nothing(name: str, tmp_path: Path) -> None:
     data = make_training_set(1 if name == "nerf-w" else 3)
     set_threads(2)

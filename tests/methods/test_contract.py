@@ -18,8 +18,10 @@ from chronoscene.harness.contract.training import (
 from chronoscene.methods import load_spec, method_names
 from chronoscene.training import photometric
 
-QUICK = [name for name in method_names() if not load_spec(name).mixes_views]
-"""Radiance fields take long; ``tests/fields`` has what is quick of the rules."""
+SLOW = {n for n in method_names() if load_spec(n).mixes_views} | {"3dgs-period", "scaffold-gs"}
+"""Radiance fields take long; ``tests/fields`` has what is quick of the rules. The other two have
+the code of ``3dgs`` and ``scaffold-gs-period``."""
+QUICK = [name for name in method_names() if name not in SLOW]
 
 SLOW_RULES = {threads_change_nothing_for_many_points}
 

@@ -17,7 +17,7 @@ def one_thread():
     set_threads()
 
 
-SHARE = 6
+SHARE = 9
 """Pairs of extreme and method of which one is tested by default: each method meets a share
 of the extremes, each extreme a share of the methods."""
 

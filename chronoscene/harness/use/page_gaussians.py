@@ -19,12 +19,10 @@ HEADER_BYTES, CENTRE_BYTES = 16, 9  # Of SPZ
 LEAST = 0.02
 """Share of the Gaussians below which a page is refused."""
 MANY, SAMPLED, GENEROUS = 500_000, 16, 1.15
-"""Above so many Gaussians of all periods, one of `SAMPLED` tells what would be too large for
-`GENEROUS` times the room: a small sample is packed less tightly."""
-
-
+"""With more Gaussians than this, those at one centre in `SAMPLED` tell how much has to go. The
+limit is then `GENEROUS` times the room, as a small sample is packed less tightly."""
 _ENDS = [3, 7, 10, 11]
-"""Where the columns of the parts of a `GaussianCloud` end, in one row of 59 values."""
+"""Columns at which the parts of a `GaussianCloud` end in a row of 59 values."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -458,6 +458,7 @@ def test_extent_of_cameras_that_stand_still(good: Registered) -> None:
     assert 5 < scene_extent(still) < 30
 
 
+@pytest.mark.slow
 def test_a_forward_facing_capture_is_measured_by_its_depth() -> None:
     """Right ones pass although cameras stand close together, wrong ones fail."""
     case = CaseSettings(arc=20.0, ties=600, points=2000, views=16, seed=5, gps_noise=None)
