@@ -150,20 +150,19 @@ def import_object(reference: str) -> Any:
 
 def method_names(group: str = ENTRY_POINT_GROUP) -> tuple[str, ...]:
     """Return the sorted names of the methods of an entry-point group; import none of them."""
-    return tuple(sorted({entry.name for entry in entry_points(group=group)}))
+    return tuple(sorted({entry.name for entry in _entries(group, tuple(sys.path))}))
 
 
 def installed_methods() -> dict[str, EntryPoint]:
     """Return the entry points of all methods, other programs among them, by name."""
-    return dict(_installed_along(tuple(sys.path)))
+    path, groups = tuple(sys.path), (PROGRAM_GROUP, ENTRY_POINT_GROUP)
+    return {entry.name: entry for group in groups for entry in _entries(group, path)}
 
 
 @cache
-def _installed_along(path: tuple[str, ...]) -> dict[str, EntryPoint]:
-    """Look through the packages of a module path, which takes as long as reading a small file of
-    each."""
-    groups = (PROGRAM_GROUP, ENTRY_POINT_GROUP)
-    return {entry.name: entry for group in groups for entry in entry_points(group=group)}
+def _entries(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Look through the packages on a module path once: it reads a file of each of them."""
+    return tuple(entry_points(group=group))
 
 
 def load_spec(name: str) -> MethodSpec:

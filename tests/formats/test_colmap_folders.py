@@ -4,7 +4,7 @@ import dataclasses
 import shutil
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -164,7 +164,6 @@ def test_folders_are_in_the_order_of_the_periods_and_safe(labels, folders):
     assert period_folders(periods) == folders
 
 
-@settings(max_examples=20)
 @given(st.lists(st.text(max_size=8), min_size=1, max_size=12))
 def test_any_labels_become_folders_in_order(labels):
     periods = tuple(Period(i, label) for i, label in enumerate(labels))

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.formats import load_format, read_scene, writable_formats
@@ -77,7 +77,6 @@ LIMITED = ("cl-splats", "neusc", "wat")
 
 
 @pytest.mark.parametrize("name", [name for name in writable_formats() if name not in LIMITED])
-@settings(max_examples=20)
 @given(parts=scenes())
 def test_round_trip(tmp_path_factory, name, parts):
     """Poses to rounding, all else exactly; `colmap-folders` has other names."""

@@ -3,7 +3,7 @@
 import dataclasses
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError
@@ -78,7 +78,6 @@ KEYS = st.from_regex("[a-z_]+", fullmatch=True)
 VALUES = st.dictionaries(KEYS, st.one_of(SCALARS, st.lists(SCALARS, max_size=3)), max_size=4)
 
 
-@settings(max_examples=20)
 @given(options=VALUES, tuning=VALUES, scenes=st.lists(VALUES, max_size=2))
 def test_what_is_written_is_read(tmp_path_factory, options, tuning, scenes):
     preset = PresetFile(

@@ -13,20 +13,16 @@ from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.train.painted_balls import make_training_set
 from chronoscene.methods import import_object, load_spec, method_names
 
+from .test_devices import SAME_NETWORKS
+
 SMALL_FIELD = {"levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
 STEPS = 12
-QUICK = [name for name in method_names() if not load_spec(name).mixes_views]
-ALL_NETWORKS = {"clnerf", "ha-nerf-t", "neusc"}
-"""Fields that have the networks of the others between them."""
 
 
 @pytest.mark.filterwarnings("ignore:.*deterministic")
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(n, marks=() if n in QUICK or n in ALL_NETWORKS else pytest.mark.slow)
-        for n in method_names()
-    ],
+    [pytest.param(n, marks=pytest.mark.slow if n in SAME_NETWORKS else ()) for n in method_names()],
 )
 def test_no_method_reads_memory_that_nobody_wrote(name: str) -> None:
     spec = load_spec(name)

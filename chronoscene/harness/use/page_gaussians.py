@@ -166,7 +166,7 @@ def unite(clouds: Sequence[GaussianCloud]) -> tuple[GaussianCloud, NDArray[np.bo
         rows = table[end : (end := end + len(cloud))]
         for part, field in zip(np.split(rows, _ENDS, axis=1), fields(cloud), strict=True):
             part[:] = getattr(cloud, field.name).reshape(part.shape)
-    order = np.argsort(table.view((np.void, 59 * 4))[:, 0], kind="stable")
+    order = np.argsort(table.view((np.void, table.strides[0]))[:, 0], kind="stable")
     table = table[order]
     bits, first = table.view("<u4"), np.ones(len(table), bool)
     first[1:] = (bits[1:] != bits[:-1]).any(axis=1)
