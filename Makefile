@@ -15,8 +15,10 @@ READY := $(VENV)/.ready
 # then from PyTorch's own; where there is none (macOS), the plain package is the CPU build.
 TORCH := torch==2.13.0
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
-# Bytecode is compiled at the end, on all cores.
+# Bytecode of the few modules in use is made when they are first loaded.
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile
+# Many processes start here, and each would compile its sources.
+unexport PYTHONDONTWRITEBYTECODE
 
 DEMO := demo
 # Tables and pages call a scene by the name of its folder.
@@ -51,10 +53,9 @@ leaderboard: $(READY)
 	rm -rf $(SITE)
 	$(BIN)/chronoscene leaderboard leaderboard/entries/measured --out $(SITE) $(RUNS:%=--runs %)
 
-# Many tests start processes, which read bytecode faster than sources.
 test: $(READY)
 	@$(MAKE) --no-print-directory --jobs=2 lint gaussian-kernels other-kernels
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
+	$(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
 
 # Each process of the tests would compile them.
 gaussian-kernels: $(READY)
@@ -81,7 +82,6 @@ $(READY): pyproject.toml constraints.txt
 		|| $(PIP) "$(TORCH)" --index-url $(TORCH_CPU_INDEX) 2>/dev/null \
 		|| $(PIP) "$(TORCH)"
 	$(PIP) --constraint constraints.txt --editable '.[dev]'
-	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # Some packages have templates
 	touch $@
 
 clean:

@@ -7,6 +7,7 @@ to patches, patches to styles; both are plain tables, which the compiled shader 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -30,10 +31,11 @@ PATCH_WIDTH = 12
 
 def cross(a: Array, b: Array) -> Array:
     """Cross product along the last axis; faster than numpy's, which supports any axes."""
-    x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    z = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return np.stack([x, y, z], axis=-1)
+    product = np.empty(np.broadcast(a, b).shape)
+    product[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    product[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    product[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return product
 
 
 def srgb(red: float, green: float, blue: float) -> Color:
@@ -68,6 +70,21 @@ class Mesh(NamedTuple):
         return np.stack([flat.min(axis=0), flat.max(axis=0)])
 
 
+class _Piece(NamedTuple):
+    """Quads or triangles of one call: of one patch or, quads alone, of one each."""
+
+    quads: Array | None
+    """First corners, first edges, second edges. [3, N, 3]"""
+    triangles: tuple[Array, Array] | None
+    """Vertices and normals. [N, 3, 3] each"""
+    row: Array | None
+    """Texture frame and extents of the one patch. [11]"""
+    size: int
+    """N."""
+    style: int
+    seed: int
+
+
 class MeshBuilder:
     """Collects quads, boxes and triangles into a `Mesh`.
 
@@ -77,12 +94,8 @@ class MeshBuilder:
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
-        self._triangles: list[tuple[Array, Array, NDArray[np.int64]]] = []
-        """Vertices, normals and patches."""
-        self._patches: list[tuple[Array, NDArray[np.int64], NDArray[np.int64]]] = []
-        """Rows, styles and seeds."""
+        self._pieces: list[_Piece] = []
         self._styles: dict[bytes, int] = {}
-        self._num_patches = 0
 
     def style(
         self,
@@ -125,22 +138,14 @@ class MeshBuilder:
                 which starts at its corner.
             seed: Varies the texture.
         """
-        o = np.atleast_2d(np.asarray(corner, np.float64))
-        u = np.broadcast_to(np.asarray(edge_u, np.float64), o.shape)
-        v = np.broadcast_to(np.asarray(edge_v, np.float64), o.shape)
-        if len(o) == 0:
+        corners = np.asarray(corner, np.float64)
+        count = len(corners) if corners.ndim == 2 else 1
+        if count == 0:
             return
-        quad = np.stack([o, o + u, o + u + v, o + v], axis=1)
-        normal = cross(u, v)
-        normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
-        tris = quad[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
-        normals = np.repeat(normal, 2, axis=0)[:, None].repeat(3, axis=1)
-        if frame is None:
-            lengths = np.sqrt(np.stack([(u * u).sum(axis=1), (v * v).sum(axis=1)], axis=1))
-            axes = np.concatenate([o, u / lengths[:, :1], v / lengths[:, 1:], lengths], axis=1)
-            self._add(tris, normals, axes, style, seed, own_texture=True)
-        else:
-            self._add(tris, normals, _frame_row(frame, quad), style, seed)
+        quads = np.empty((3, count, 3))
+        quads[0], quads[1], quads[2] = corners, edge_u, edge_v
+        row = None if frame is None else _frame_row(frame, _corners(quads))
+        self._pieces.append(_Piece(quads, None, row, count, style, seed))
 
     def boxes(
         self,
@@ -166,25 +171,31 @@ class MeshBuilder:
             seed: Varies the texture.
             bottom: Whether to add the face at ``-c`` as well.
         """
-        o, a, b, c = np.broadcast_arrays(np.atleast_2d(np.asarray(corner, np.float64)), a, b, c)
-        self.quads(o, a, c, style, seed=seed)
-        self.quads(o + a, b, c, style, seed=seed + 1)
-        self.quads(o + a + b, -a, c, style, seed=seed + 2)
-        self.quads(o + b, -b, c, style, seed=seed + 3)
-        self.quads(o + c, a, b, style if top is None else top, seed=seed + 4)
+        given = [np.asarray(x, np.float64) for x in (corner, a, b, c)]
+        edges = np.empty((4, *np.broadcast(np.atleast_2d(given[0]), *given[1:]).shape))
+        for edge, value in zip(edges, given, strict=True):
+            edge[:] = value
+        o, x, y, z = edges
+        self.quads(o, x, z, style, seed=seed)
+        self.quads(o + x, y, z, style, seed=seed + 1)
+        self.quads(o + x + y, -x, z, style, seed=seed + 2)
+        self.quads(o + y, -y, z, style, seed=seed + 3)
+        self.quads(o + z, x, y, style if top is None else top, seed=seed + 4)
         if bottom:
-            self.quads(o + b, a, -b, style, seed=seed + 5)
+            self.quads(o + y, x, -y, style, seed=seed + 5)
 
     def polygon(
         self, points: ArrayLike, style: int, *, frame: TextureFrame | None = None, seed: int = 0
     ) -> None:
         """Add a convex polygon, counter-clockwise seen from outside. [K, 3]"""
         p = np.asarray(points, np.float64)
-        tris = np.stack([np.stack([p[0], p[i], p[i + 1]]) for i in range(1, len(p) - 1)])
+        tris = np.empty((len(p) - 2, 3, 3))
+        tris[:, 0], tris[:, 1], tris[:, 2] = p[0], p[1:-1], p[2:]
         normal = cross(p[1] - p[0], p[2] - p[0])
-        normal /= np.linalg.norm(normal)
+        normal /= math.sqrt(normal @ normal)
         if frame is None:
-            u = (p[1] - p[0]) / np.linalg.norm(p[1] - p[0])
+            u = p[1] - p[0]
+            u /= math.sqrt(u @ u)
             frame = (p[0], u, cross(normal, u))
         normals = np.broadcast_to(normal, tris.shape)
         self._add(tris, normals, _frame_row(frame, p), style, seed)
@@ -206,39 +217,69 @@ class MeshBuilder:
 
     def build(self) -> Mesh:
         """The collected geometry."""
-        vertices, normals, tri_patch = map(np.concatenate, zip(*self._triangles, strict=True))
-        patches, patch_style, patch_seed = map(np.concatenate, zip(*self._patches, strict=True))
+        pieces = self._pieces
+        counts = np.array([piece.size for piece in pieces])
+        own = np.array([piece.row is None for piece in pieces])
+        of_quads = np.array([piece.quads is not None for piece in pieces])
+        patches, num_tris = np.where(own, counts, 1), np.where(of_quads, 2 * counts, counts)
+        vertices, normals = np.empty((2, num_tris.sum(), 3, 3), np.float32)
+        own_patch = np.repeat(own, patches)
+        table = np.zeros((len(own_patch), PATCH_WIDTH))
+        if of_quads.any():
+            here = np.repeat(of_quads, num_tris)
+            quads = np.concatenate([p.quads for p in pieces if p.quads is not None], axis=1)
+            _, u, v = quads
+            normal = cross(u, v)
+            normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
+            vertices[here] = _corners(quads)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
+            normals[here] = np.repeat(normal, 2, axis=0)[:, None]
+            alone = np.repeat(own[of_quads], counts[of_quads])
+            table[own_patch, :11] = _own_rows(quads[:, alone])
+        if not of_quads.all():
+            here = np.repeat(~of_quads, num_tris)
+            solid = [p.triangles for p in pieces if p.triangles is not None]
+            vertices[here], normals[here] = map(np.concatenate, zip(*solid, strict=True))
+        if not own.all():
+            table[~own_patch, :11] = [p.row for p in pieces if p.row is not None]
+        numbers = np.arange(len(table))
+        # Pieces that share a frame are one texture, so they must share the seed as well.
+        seeds = np.array([self._seed + 7919 * (piece.seed + 1) for piece in pieces])
+        seeds = np.repeat(seeds, patches) + np.where(own_patch, 31 * numbers, 0)
         return Mesh(
-            vertices.astype(np.float32),
-            normals.astype(np.float32),
-            tri_patch.astype(np.int32),
-            patches,
-            patch_style.astype(np.int32),
-            patch_seed.astype(np.int32),
+            vertices,
+            normals,
+            np.repeat(numbers, np.repeat(num_tris // patches, patches)).astype(np.int32),
+            table,
+            np.repeat([piece.style for piece in pieces], patches).astype(np.int32),
+            (seeds % 1_000_003).astype(np.int32),
             np.stack([np.frombuffer(row) for row in self._styles]),
         )
 
-    def _add(
-        self, tris: Array, normals: Array, rows: Array, style: int, seed: int,
-        *, own_texture: bool = False,
-    ) -> None:  # fmt: skip
-        """Add triangles of patches that have as many triangles each."""
-        count, numbers = len(rows), self._num_patches + np.arange(len(rows))
-        table = np.zeros((count, PATCH_WIDTH))
-        table[:, : rows.shape[1]] = rows
-        # Pieces that share a frame are one texture, so they must share the seed as well.
-        vary = 31 * numbers if own_texture else 0 * numbers
-        seeds = (self._seed + 7919 * (seed + 1) + vary) % 1_000_003
-        self._patches.append((table, np.full(count, style), seeds))
-        self._triangles.append((tris, normals, np.repeat(numbers, len(tris) // count)))
-        self._num_patches += count
+    def _add(self, vertices: Array, normals: Array, row: Array, style: int, seed: int) -> None:
+        piece = _Piece(None, (vertices, normals), row, len(vertices), style, seed)
+        self._pieces.append(piece)
+
+
+def _corners(quads: Array) -> Array:
+    """Corners of parallelograms, counter-clockwise. [N, 4, 3]"""
+    o, u, v = quads
+    return np.stack([o, o + u, o + u + v, o + v], axis=1)
+
+
+def _own_rows(quads: Array) -> Array:
+    """Patch rows of textures that start at the corner of each quad. [N, 11]"""
+    o, u, v = quads
+    lengths = np.sqrt(np.stack([(u * u).sum(axis=1), (v * v).sum(axis=1)], axis=1))
+    return np.concatenate([o, u / lengths[:, :1], v / lengths[:, 1:], lengths], axis=1)
 
 
 def _frame_row(frame: TextureFrame, points: Array) -> Array:
-    """Patch row of a texture frame; the extents reach the farthest of the points."""
-    origin, u, v = (np.asarray(x, np.float64) for x in frame)
-    local = points.reshape(-1, 3) - origin
-    return np.concatenate([origin, u, v, [(local @ u).max(), (local @ v).max()]])[None]
+    """Patch row of a texture frame; the extents reach the farthest of the points. [11]"""
+    row = np.empty(11)
+    row[0:3], row[3:6], row[6:9] = frame
+    local = points.reshape(-1, 3) - row[0:3]
+    row[9], row[10] = (local @ row[3:6]).max(), (local @ row[6:9]).max()
+    return row
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:

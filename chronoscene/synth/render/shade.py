@@ -245,6 +245,6 @@ def albedo_at(points, tri, tables, fw):  # type: ignore[no-untyped-def]
     out = np.zeros((len(points), 3))
     for i in prange(len(points)):
         if tri[i] != MISS:
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
             out[i] = surface_albedo(tables, tri[i], x, y, z, max(1e-4, fw[i]))
     return out

@@ -78,8 +78,8 @@ def test_what_goes_first_where_room_is_short():
 
 
 def test_a_sample_tells_what_is_too_large(monkeypatch):
-    first, second = cloud(20_000), cloud(20_000)
-    second.sh_coeffs[10_000:] *= -1
+    first, second = cloud(10_000), cloud(10_000)
+    second.sh_coeffs[5_000:] *= -1
     runs = [[first, second]]
     packed_clouds = []
 
@@ -88,10 +88,10 @@ def test_a_sample_tells_what_is_too_large(monkeypatch):
         return unite(clouds)
 
     monkeypatch.setattr(page_gaussians, "unite", count)
-    for room in (1.1e6, 4e5):
-        monkeypatch.setattr(page_gaussians, "MANY", 40_000)
+    for room in (5.5e5, 2e5):
+        monkeypatch.setattr(page_gaussians, "MANY", 20_000)
         _, tried = fit_gaussians(runs, [True], room)
-        monkeypatch.setattr(page_gaussians, "MANY", 39_999)
+        monkeypatch.setattr(page_gaussians, "MANY", 19_999)
         packed_clouds.clear()
         packed, guessed = fit_gaussians(runs, [True], room)
         assert len(packed[0].text) <= room and guessed.degree == tried.degree
