@@ -16,9 +16,8 @@ from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.train.painted_balls import make_training_set
 from chronoscene.methods import build_config, import_object, load_spec, method_names
 
-SMALL_FIELD = {
-    "levels": 4, "log2_rows": 10, "finest": 32, "hidden": 16, "cells": 16, "samples": 2_048,
-}  # fmt: skip
+from .small_fields import SMALL_FIELD
+
 STEPS = 24
 FIELD_STEPS = 6
 NEEDS_MORE = {"densification=mcmc", "fusion=sum"}

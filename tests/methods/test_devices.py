@@ -36,6 +36,8 @@ from chronoscene.methods import (
 )
 from chronoscene.training import devices
 
+from .small_fields import SAME_NETWORKS, SMALL_FIELD
+
 STEPS = 3
 TRAINED = PAUSE + 12
 """Steps of the trainings that go from one device to another."""
@@ -52,17 +54,6 @@ QUESTIONS = 3
 fields: how many samples there are, how many are seen; and how the step went."""
 MORE_QUESTIONS = {"ha-nerf": 1, "ha-nerf-t": 1}
 """The photos that have been drawn have to be encoded."""
-SMALL_FIELD = {
-    "samples": 4096,
-    "levels": 4,
-    "log2_rows": 12,
-    "finest": 64,
-    "hidden": 16,
-    "cells": 16,
-}
-"""Fields in plain torch are slow on a CPU."""
-SAME_NETWORKS = {"nerf-t", "nerf-w", "ha-nerf", "meil-nerf"}
-"""Fields whose networks are among those of `nerf-w-t`, `ha-nerf-t` and `clnerf`."""
 
 
 @dataclass

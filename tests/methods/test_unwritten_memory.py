@@ -13,9 +13,8 @@ from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.train.painted_balls import make_training_set
 from chronoscene.methods import import_object, load_spec, method_names
 
-from .test_devices import SAME_NETWORKS
+from .small_fields import SAME_NETWORKS, SMALL_FIELD
 
-SMALL_FIELD = {"levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
 STEPS = 12
 
 
@@ -29,7 +28,7 @@ def test_no_method_reads_memory_that_nobody_wrote(name: str) -> None:
     data = make_training_set(tiny_training.periods_for(spec))
     config = tiny_training.small_config(spec)
     if isinstance(config, FieldConfig):
-        config = dataclasses.replace(config, **SMALL_FIELD)  # type: ignore[arg-type]
+        config = dataclasses.replace(config, **SMALL_FIELD)
 
     def image() -> np.ndarray:
         method = import_object(spec.method)(config)
