@@ -72,11 +72,12 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# A torch that is in the environment already, a CUDA build perhaps, is kept.
+# A torch that is in the environment already, a CUDA build perhaps, is kept. Older versions of pip
+# take half a minute more to choose among all files of an index.
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "Python 3.11 or newer is needed; name one: make PYTHON=python3.11" >&2; exit 1; }
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	test -x $(BIN)/python || $(PYTHON) -m venv --upgrade-deps $(VENV)
 	$(BIN)/python -c 'import torch' 2>/dev/null \
 		|| $(PIP) "$(TORCH)+cpu" 2>/dev/null \
 		|| $(PIP) "$(TORCH)" --index-url $(TORCH_CPU_INDEX) 2>/dev/null \
