@@ -71,7 +71,7 @@ def test_every_choice_trains_or_is_refused(
     spec = load_spec(name)
     steps, small = STEPS, {}
     if issubclass(import_object(spec.config), FieldConfig):
-        steps, small = FIELD_STEPS, SMALL_FIELD
+        steps, small = FIELD_STEPS, SMALL_FIELD | {"samples": 2048}
     overrides = {"iterations": steps, **small, option: value}
     try:
         config = build_config(spec, preset="fast", overrides=overrides)

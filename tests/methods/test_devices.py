@@ -70,7 +70,7 @@ class Compiled:
         config = tiny_training.small_config(self.spec)
         options: dict[str, Any] = {"exposure": "image", "random_background": True}
         if isinstance(config, FieldConfig):
-            options |= SMALL_FIELD
+            options |= SMALL_FIELD | {"samples": 4096}
         known = {k: v for k, v in options.items() if hasattr(config, k)}
         method: Method = import_object(self.spec.method)(dataclasses.replace(config, **known))
         method.setup(self.data, seed=0, device=device)

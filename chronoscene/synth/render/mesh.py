@@ -71,16 +71,14 @@ class Mesh(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Quads or triangles of one call: of one patch or, quads alone, of one each."""
+    """N quads or triangles of one call: of one patch or, quads alone, of one each."""
 
-    quads: Array | None
-    """First corners, first edges, second edges. [3, N, 3]"""
-    triangles: tuple[Array, Array] | None
-    """Vertices and normals. [N, 3, 3] each"""
+    quads: bool
+    values: Array
+    """First corners, first and second edges of quads, [3, N, 3]; or vertices and normals of
+    triangles, [2, N, 3, 3]."""
     row: Array | None
     """Texture frame and extents of the one patch. [11]"""
-    size: int
-    """N."""
     style: int
     seed: int
 
@@ -145,7 +143,7 @@ class MeshBuilder:
         quads = np.empty((3, count, 3))
         quads[0], quads[1], quads[2] = corners, edge_u, edge_v
         row = None if frame is None else _frame_row(frame, _corners(quads))
-        self._pieces.append(_Piece(quads, None, row, count, style, seed))
+        self._pieces.append(_Piece(True, quads, row, style, seed))
 
     def boxes(
         self,
@@ -171,10 +169,8 @@ class MeshBuilder:
             seed: Varies the texture.
             bottom: Whether to add the face at ``-c`` as well.
         """
-        given = [np.asarray(x, np.float64) for x in (corner, a, b, c)]
-        edges = np.empty((4, *np.broadcast(np.atleast_2d(given[0]), *given[1:]).shape))
-        for edge, value in zip(edges, given, strict=True):
-            edge[:] = value
+        edges = np.empty((4, *np.broadcast(np.atleast_2d(corner), a, b, c).shape))
+        edges[0], edges[1], edges[2], edges[3] = corner, a, b, c
         o, x, y, z = edges
         self.quads(o, x, z, style, seed=seed)
         self.quads(o + x, y, z, style, seed=seed + 1)
@@ -218,16 +214,16 @@ class MeshBuilder:
     def build(self) -> Mesh:
         """The collected geometry."""
         pieces = self._pieces
-        counts = np.array([piece.size for piece in pieces])
+        counts = np.array([piece.values.shape[1] for piece in pieces])
         own = np.array([piece.row is None for piece in pieces])
-        of_quads = np.array([piece.quads is not None for piece in pieces])
+        of_quads = np.array([piece.quads for piece in pieces])
         patches, num_tris = np.where(own, counts, 1), np.where(of_quads, 2 * counts, counts)
         vertices, normals = np.empty((2, num_tris.sum(), 3, 3), np.float32)
         own_patch = np.repeat(own, patches)
         table = np.zeros((len(own_patch), PATCH_WIDTH))
         if of_quads.any():
             here = np.repeat(of_quads, num_tris)
-            quads = np.concatenate([p.quads for p in pieces if p.quads is not None], axis=1)
+            quads = np.concatenate([p.values for p in pieces if p.quads], axis=1)
             _, u, v = quads
             normal = cross(u, v)
             normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
@@ -237,8 +233,8 @@ class MeshBuilder:
             table[own_patch, :11] = _own_rows(quads[:, alone])
         if not of_quads.all():
             here = np.repeat(~of_quads, num_tris)
-            solid = [p.triangles for p in pieces if p.triangles is not None]
-            vertices[here], normals[here] = map(np.concatenate, zip(*solid, strict=True))
+            solid = np.concatenate([p.values for p in pieces if not p.quads], axis=1)
+            vertices[here], normals[here] = solid
         if not own.all():
             table[~own_patch, :11] = [p.row for p in pieces if p.row is not None]
         numbers = np.arange(len(table))
@@ -256,8 +252,7 @@ class MeshBuilder:
         )
 
     def _add(self, vertices: Array, normals: Array, row: Array, style: int, seed: int) -> None:
-        piece = _Piece(None, (vertices, normals), row, len(vertices), style, seed)
-        self._pieces.append(piece)
+        self._pieces.append(_Piece(False, np.stack([vertices, normals]), row, style, seed))
 
 
 def _corners(quads: Array) -> Array:
