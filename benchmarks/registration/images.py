@@ -6,8 +6,11 @@ import argparse
 import shutil
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from PIL import Image, ImageEnhance
@@ -24,6 +27,7 @@ from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.synth import SynthSettings, generate
+from chronoscene.synth.city.world import World
 
 ORIGIN = Georeference(48.1, 11.5, 520.0, "as stated")
 
@@ -51,6 +55,8 @@ class ImageCase:
     width: int = 800
     """Pixels."""
     height: int = 600
+    passes: tuple[float, ...] = ()
+    """Degrees to the left of the way in which each walk around a block looks."""
     other_place: bool = False
     """True if the last period shows another city, so that nothing can be right. It is mirrored,
     because the textures of all cities are alike."""
@@ -75,6 +81,8 @@ CASES = (
     ImageCase("street, two periods", 41, kind="street"),
     ImageCase("street, two periods, 40 photos a date", 45, kind="street", views=40),
     ImageCase("street, two periods, 80 photos a date", 45, kind="street", views=80),
+    ImageCase("street, then to the side", 45, kind="street", views=156, passes=(0.0, 90.0)),
+    ImageCase("street, then diagonally", 45, kind="street", views=156, passes=(0.0, 45.0)),
     ImageCase("street, half rebuilt, dark", 42, kind="street", rebuilt=0.5, gamma=1.6),
     ImageCase("other place", 43, other_place=True),
     ImageCase("other place, no GPS", 44, other_place=True, gps=False),
@@ -171,8 +179,44 @@ def _render(case: ImageCase, folder: Path, seed: int) -> Scene:
             kind=case.kind, periods=case.periods, width=case.width, height=case.height,
             views=case.views, points=2000, blocks=case.blocks, seed=seed, rebuilt=case.rebuilt,
         )  # fmt: skip
-        generate(folder, settings)
+        with ExitStack() as patches:
+            if case.passes:
+                walk = partial(_around_a_block, passes=case.passes)
+                patches.enter_context(patch("chronoscene.synth.flights._walk", walk))
+            generate(folder, settings, truth=False)
     return read_scene(folder)
+
+
+def _around_a_block(
+    world: World, count: int, rng: np.random.Generator, *, passes: tuple[float, ...]
+) -> list[tuple[Array, Array]]:
+    """Walk around one block for each pass, turning gradually in the corners."""
+    lines = [
+        sorted({round(float(a[k]), 6) for a, b in world.roads if abs(a[k] - b[k]) < 1e-6})[:2]
+        for k in (0, 1)
+    ]
+    (left, right), (front, back) = lines
+    ring = np.array([[left, front], [right, front], [right, back], [left, back], [left, front]])
+    at = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1)))
+
+    def place(s: float) -> Array:
+        return np.array([np.interp(s % at[-1], at, ring[:, k]) for k in (0, 1)])
+
+    planned = []
+    each = count // len(passes)
+    for degrees in passes:
+        start = rng.uniform(0, at[-1])
+        for i in range(each):
+            s = start + at[-1] * (i + rng.uniform(-0.2, 0.2)) / each
+            way = place(s + 4) - place(s - 4)
+            way /= np.linalg.norm(way)
+            side = np.array([-way[1], way[0]])
+            yaw = np.radians(degrees) + rng.normal(0, 0.06)
+            toward = np.cos(yaw) * way + np.sin(yaw) * side
+            eye = np.array([*(place(s) + rng.uniform(-0.8, 0.8) * side), rng.uniform(1.6, 1.9)])
+            target = np.array([*(eye[:2] + 10 * toward), eye[2] + rng.uniform(0.3, 1.5)])
+            planned.append((eye, target))
+    return planned
 
 
 def _noisy(rng: np.random.Generator, centres: Array) -> Array:

@@ -125,6 +125,8 @@ class Registered:
     """True if points of two images and of small angles count."""
     held: bool = False
     """True if focal lengths are those that photos state."""
+    loose: frozenset[str] = frozenset()
+    """Images in parts that most matches with the rest contradict (`consistency.loose_parts`)."""
     unplaced: frozenset[str] = frozenset()
     """Images of periods that are in a frame of their own, to be placed by tie points."""
     features: str = METHOD

@@ -33,7 +33,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-VERSION = 1  # Version of what stages store; other versions are not read
+VERSION = 2  # Version of what stages store; other versions are not read
 PATIENCE = 5.0  # Seconds; a task ends within one second after its command was killed
 
 

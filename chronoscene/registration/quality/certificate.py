@@ -63,6 +63,8 @@ class PeriodFigures:
     gps: PeriodGpsFit | str
     in_three: float | None = None
     """Share of the points that its images see that three images or more see, of whatever date."""
+    loose: tuple[str, ...] = ()
+    """Images in parts of the model that most matches with the rest contradict, sorted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +217,7 @@ def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures
         observations=len(rays),
         gps=gps,
         in_three=_in_three(model, evidence.seen[:, period]),
+        loose=tuple(n for n, i in zip(model.names, mine, strict=True) if i and n in model.loose),
     )
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from chronoscene.arrays import Array
 from chronoscene.scene.similarity import SIGMA, fit_robustly
 
 MIN_POSITIONS = 4  # Positions that a period needs
+NEIGHBOURS = 15
+"""Cameras in one place whose median counts: more than half of them are hardly ever outliers."""
 
 SPREAD_FACTOR = 3.0
 """The positions of a period must spread over this many times the error of the receiver."""
@@ -22,6 +25,8 @@ class PeriodGpsFit:
     positions: int
     median: float
     """Distance after the similarity that fits this period best."""
+    local: float
+    """Largest median of that distance over neighbouring cameras."""
     largest: float
     outliers: int
     """Positions off by more than three robust standard deviations."""
@@ -63,6 +68,7 @@ def fit_gps(centres: Array, gps: Array) -> PeriodGpsFit | str:
     return PeriodGpsFit(
         positions=int(has.sum()),
         median=float(np.median(distance)),
+        local=_largest_local_median(source, distance),
         largest=float(distance.max()),
         outliers=int((distance > 3 * SIGMA * np.median(distance)).sum()),
         scale=scale,
@@ -72,6 +78,13 @@ def fit_gps(centres: Array, gps: Array) -> PeriodGpsFit | str:
         offset=offset,
         offset_error=error,
     )
+
+
+def _largest_local_median(places: Array, values: Array) -> float:
+    """Largest median over a place and its nearest ones."""
+    count = min(NEIGHBOURS, len(places))
+    nearest = cKDTree(places).query(places, count)[1].reshape(len(places), -1)
+    return float(np.median(values[nearest], axis=1).max())
 
 
 def _scale_and_turn(

@@ -122,6 +122,14 @@ THRESHOLDS: dict[str, Threshold] = {
         todo="calibrate each date (--calibration per-period), or add oblique photos; otherwise "
         + _CONTROL,
     ),
+    "loose": Threshold(
+        what="photos in parts of the model that most of their matches contradict",
+        doubtful=0.0,
+        why="where few photos turn a corner, what comes behind can get another size: each two "
+        "photos agree with that, but not what three of them see; or false matches hold the part",
+        todo="photograph the way between these photos and the others again, with steps so short "
+        "that three photos show every spot, also in corners; or leave the photos out",
+    ),
     "occupied": Threshold(
         what="share of the overlap of two periods that has tie points",
         doubtful=0.15, larger_is_better=True,
@@ -140,7 +148,7 @@ THRESHOLDS: dict[str, Threshold] = {
         why="photos that overlap with the next one alone let a row bend, and nothing shows it; "
         "counts only beside other findings",
         todo="photograph more, so that three photos show every spot: steps half as long, a second "
-        "pass along each row that looks to the side or back, and loops or crossings that connect "
+        "pass along each row that looks diagonally ahead, and loops or crossings that connect "
         "rows",
     ),
     "localised": Threshold(
@@ -178,7 +186,7 @@ THRESHOLDS: dict[str, Threshold] = {
         todo=f"if the GPS is reliable, {_CLICK}",
     ),
     "gps_residual": Threshold(
-        what="residual of a period's cameras to its own GPS, median",
+        what="residual of a period's cameras to its own GPS, median of neighbouring ones",
         unit="m", doubtful=12.0,
         why="receivers err by 3 to 8 m; more means that part of the poses is wrong, or that the "
         "view of the sky was obstructed",
@@ -334,9 +342,11 @@ def _of_period(p: PeriodFigures) -> Iterator[Objection]:
         far = [reason for reason in p.reasons if reason.endswith(ANOTHER_PLACE)]
         yield replace(found, found=f"{found.found}; {far[0]}", todo=_PLACE) if far else found
     yield from _check("images", p.registered, place)
+    if p.loose:
+        yield from _check("loose", len(p.loose), place, f" ({p.loose[0]} to {p.loose[-1]})")
     if isinstance(p.gps, PeriodGpsFit):
         gps = p.gps
-        yield from _check("gps_residual", gps.median, place)
+        yield from _check("gps_residual", gps.local, place)
         if gps.scale is not None and gps.scale_error is not None:
             beyond = abs(gps.scale - 1) - 3 * gps.scale_error
             yield from _check("gps_scale", 100 * beyond, place)

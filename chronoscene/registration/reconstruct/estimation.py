@@ -215,6 +215,7 @@ def _assemble(
         stated={c.name: stated(c) for c in inputs.images},
         short=result["short"],
         held=result["held"],
+        loose=frozenset(result["loose"]),
     )
 
 

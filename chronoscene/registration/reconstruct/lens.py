@@ -20,6 +20,7 @@ from chronoscene.registration.features.database import copy_with_cameras
 from chronoscene.registration.photos.stated import contradicts
 from chronoscene.registration.reconstruct.focal import Focals, stated_focals
 from chronoscene.registration.reconstruct.mapping import Task, adjust, triangulate
+from chronoscene.registration.reconstruct.models import only
 
 MIN_GAIN = 0.02  # Share by which the median reprojection error must shrink
 
@@ -91,10 +92,7 @@ def _part(model: pycolmap.Reconstruction, cameras: Sequence[int]) -> pycolmap.Re
             for element in model.points3D[point.point3D_id].track.elements
         )
         kept |= set(sorted(own, key=lambda i: -shared[i])[:TRIED])
-    part = pycolmap.Reconstruction(model)
-    for image_id in set(ids) - kept:
-        part.deregister_frame(part.images[image_id].frame_id)
-    return part
+    return only(model, kept)
 
 
 def _gains(found: pycolmap.Reconstruction, before: float) -> bool:

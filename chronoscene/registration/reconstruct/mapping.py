@@ -19,6 +19,7 @@ from chronoscene.registration.reconstruct.candidates import (
     support,
     without_weak_pairs,
 )
+from chronoscene.registration.reconstruct.consistency import loose_parts, point_agreements
 from chronoscene.registration.reconstruct.gps_alignment import Priors
 from chronoscene.registration.reconstruct.models import summary, write_model
 
@@ -106,6 +107,8 @@ class Task:
     def finish(self, model: pycolmap.Reconstruction, **result: Any) -> dict[str, Any]:
         """Write the model, and return the result of the task, as JSON."""
         write_model(model, self.out, self.photos)
+        _, matches = verified_matches(self.database)
+        loose = loose_parts(point_agreements(model, matches), model.reg_image_ids())
         return {
             "remarks": self.remarks,
             "is_georeferenced": False,
@@ -115,6 +118,7 @@ class Task:
             "unplaced": [],
             "short": self.short,
             "held": self.held,
+            "loose": sorted(str(model.images[i].name) for i in loose),
         } | result
 
 

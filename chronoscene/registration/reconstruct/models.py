@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,14 @@ def set_poses(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> set[i
     for name, pose in poses.items():
         set_pose(model, ids[name], pycolmap.Rigid3d(np.array(pose, np.float64)))
     return {ids[name] for name in poses}
+
+
+def only(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> pycolmap.Reconstruction:
+    """Copy a model, with the poses of some of its images alone."""
+    part = pycolmap.Reconstruction(model)
+    for image_id in set(model.reg_image_ids()) - set(image_ids):
+        part.deregister_frame(part.images[image_id].frame_id)
+    return part
 
 
 def sorted_ids(model: pycolmap.Reconstruction) -> list[int]:

@@ -18,10 +18,14 @@ from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.control.adjustment import add_point, adjust_with_control
 from chronoscene.registration.features.database import copy_with_cameras, verified_matches
 from chronoscene.registration.reconstruct.consistency import (
+    MIN_LINK,
     Matches,
     agreement,
     deregister_misplaced,
+    loosest_part,
     pair_agreements,
+    point_agreements,
+    share_across,
 )
 from chronoscene.registration.reconstruct.focal import hold_focals
 from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
@@ -34,7 +38,7 @@ from chronoscene.registration.reconstruct.mapping import (
     register_rest,
     triangulate,
 )
-from chronoscene.registration.reconstruct.models import known_images, set_poses, summary
+from chronoscene.registration.reconstruct.models import known_images, only, set_poses, summary
 from chronoscene.registration.reconstruct.submodels import Combined, Submodel, combine
 
 MIN_POINTS = 50
@@ -44,7 +48,8 @@ MIN_AGREEMENT = 0.5
 """Share of the matches among the photos of the scene that must agree with its poses."""
 
 ROUNDS = 2  # Of triangulation with all matches and bundle adjustment, after merging
-ATTEMPTS = 2  # To register an image: at the second, more of the others have poses
+ATTEMPTS = 2
+"""To register an image, as at the second more of the others have poses; to place loose parts."""
 
 
 def joint(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -110,13 +115,10 @@ def _merged(
         task.report("aligning", 0, 1)
         combined = combine(submodels, matches, priors, task.database, keep_unplaced=keep_unplaced)
         task.remarks.extend(combined.remarks)
-        model = combined.model
-        for i in range(ROUNDS):
-            task.report("adjusting", i, ROUNDS)
-            model = triangulate(model, task, "points")
-            adjust(model, task)
+        model = _adjusted_in_rounds(combined.model, task)
     if not keep_unplaced:  # periods that wait for tie points would contradict the others
         model = _settled(model, matches, len(arguments["periods"]), task)
+        model = rejoined(model, matches, priors, task)
     if arguments.get("full_lens", False):
         model = with_full_lens(model, task, arguments.get("focals", {}))
     task.report("adjusting", 0, 1)
@@ -136,6 +138,46 @@ def _merged(
         left=[list(group) for group in combined.left],
         unplaced=list(combined.unplaced),
     )
+
+
+def _adjusted_in_rounds(model: pycolmap.Reconstruction, task: Task) -> pycolmap.Reconstruction:
+    for i in range(ROUNDS):
+        task.report("adjusting", i, ROUNDS)
+        model = triangulate(model, task, "points")
+        adjust(model, task)
+    return model
+
+
+def rejoined(
+    model: pycolmap.Reconstruction, matches: Matches, priors: Priors, task: Task
+) -> pycolmap.Reconstruction:
+    """Place parts that most matches contradict again, by matches or GPS, if that helps."""
+    for _ in range(ATTEMPTS):
+        agreements = point_agreements(model, matches)
+        ids = sorted(model.reg_image_ids())
+        part = loosest_part(agreements, ids)
+        if not part:
+            break
+        names = sorted(str(model.images[i].name) for i in part)
+        place = f"part of {len(part)} images, {names[0]} to {names[-1]}"
+        halves = [
+            Submodel(label, triangulate(only(model, some), task, "part"))
+            for label, some in (("the rest", set(ids) - part), (place, part))
+        ]
+        combined = combine(halves, matches, priors, task.database)
+        before = share_across(agreements, part)
+        remark = f"{place}: {before:.0%} of the matches with the others agree with it"
+        if combined.left:
+            task.remarks.append(f"{remark}; neither matches nor GPS place it elsewhere")
+            break
+        found = _adjusted_in_rounds(combined.model, task)
+        after = share_across(point_agreements(found, matches), part)
+        if after < max(before, MIN_LINK):
+            task.remarks.append(f"{remark}, and {after:.0%} where it was placed again: left")
+            break
+        model = found
+        task.remarks.extend([*combined.remarks, f"{remark}, and {after:.0%} where it is now"])
+    return model
 
 
 def _settled(

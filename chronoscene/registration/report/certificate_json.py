@@ -68,12 +68,15 @@ def period_figures(period: PeriodFigures) -> Iterator[Figure]:
     if period.in_three is not None:
         share, over = 100 * period.in_three, "points that its images see"
         yield Figure("points that three images or more see", share, "%", over)
+    yield Figure("images in parts that most matches contradict", len(period.loose), "", photos)
     gps = period.gps
     if not isinstance(gps, PeriodGpsFit):
         yield Figure("GPS residual", None, "m", "", absent=gps)
         return
     over = f"{gps.positions} positions"
     yield Figure("GPS residual after a similarity, median", gps.median, "m", over)
+    name = "GPS residual after a similarity, largest median of neighbouring cameras"
+    yield Figure(name, gps.local, "m", over)
     yield Figure("GPS residual after a similarity, largest", gps.largest, "m", over)
     yield Figure("GPS outliers", gps.outliers, "", over)
     offset, error = np.linalg.norm(gps.offset[:2]), np.linalg.norm(gps.offset_error[:2])

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.registration.generated import CaseSettings, generate_case, pose_errors
 from chronoscene.registration.quality import certificate as certificate_module
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
-from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
+from chronoscene.registration.quality.gps_fit import NEIGHBOURS, PeriodGpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment, Motion, Transfers
 from chronoscene.registration.quality.overlap import tie_spread
@@ -487,6 +489,29 @@ def test_a_period_far_from_its_own_gps_is_doubtful(good: Registered) -> None:
     verdict = judge(certify(replace(good, gps_enu=gps)))
     assert verdict.level != "pass"
     assert any(f.check == "gps_residual" and f.place == "period 2017" for f in verdict.objections)
+
+
+@given(st.integers(0, 10**6))
+def test_a_displaced_part_shows_in_the_gps_of_neighbours(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-60, 60, (80, 3)) * [1, 1, 0.05]
+    gps = places + rng.normal(0, 3.0, places.shape)
+    gps[rng.permutation(80)[:4]] += rng.normal(0, 100, 3)  # scattered outliers do no harm
+    fit = fit_gps(places, gps)
+    assert isinstance(fit, PeriodGpsFit) and fit.local < THRESHOLDS["gps_residual"].doubtful
+    part = np.argsort(np.linalg.norm(places - places[0], axis=1))[: NEIGHBOURS + 4]
+    gps[part] += [40.0, 30.0, 0.0]
+    fit = fit_gps(places, gps)
+    assert isinstance(fit, PeriodGpsFit)
+    assert fit.median < THRESHOLDS["gps_residual"].doubtful < fit.local
+
+
+def test_loose_parts_belong_to_their_periods(good: Registered) -> None:
+    names = [n for n, p in zip(good.names, good.periods, strict=True) if p == 1][:4]
+    found = certify(replace(good, loose=frozenset(names)))
+    assert [p.loose for p in found.periods] == [(), tuple(names)]
+    (objection,) = (f for f in judge(found).objections if f.check == "loose")
+    assert f"4, expected at most 0 ({names[0]} to {names[-1]})" in objection.found
 
 
 def test_one_period_is_not_praised_for_an_alignment() -> None:

@@ -48,7 +48,7 @@ def beyond(value: float, low: float = 0.0) -> Excess:
 def made(count: int = 2) -> Certificate:
     """A registration that passes with a margin in every figure."""
     gps = PeriodGpsFit(
-        positions=20, median=3.0, largest=9.0, outliers=0,
+        positions=20, median=3.0, local=4.0, largest=9.0, outliers=0,
         scale=1.0, scale_error=0.01, turn=0.0, turn_error=0.5,
         offset=np.zeros(3), offset_error=np.array([0.3, 0.1, 50.0]),
     )  # fmt: skip
@@ -101,6 +101,10 @@ def with_gps(certificate: Certificate, period: int = 1, **changes: Any) -> Certi
     gps = certificate.periods[period].gps
     assert isinstance(gps, PeriodGpsFit)
     return with_period(certificate, period, gps=replace(gps, **changes))
+
+
+def with_loose(certificate: Certificate, count: int) -> Certificate:
+    return with_period(certificate, 1, loose=tuple(f"{i}.jpg" for i in range(count)))
 
 
 def with_pair(
@@ -277,7 +281,8 @@ LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
         "gps_offset", "fail",
         lambda c, x: with_gps(c, offset=np.array([x, 0.0, 0.0])), 16.27, 16.28,
     ),
-    "gps residual": ("gps_residual", "doubtful", lambda c, x: with_gps(c, median=x), 11.9, 12.1),
+    "loose": ("loose", "doubtful", with_loose, 0, 3),
+    "gps residual": ("gps_residual", "doubtful", lambda c, x: with_gps(c, local=x), 11.9, 12.1),
     "gps scale": ("gps_scale", "doubtful", lambda c, x: with_gps(c, scale=x), 1.0499, 1.0501),
     "gps scale, small": (
         "gps_scale", "doubtful", lambda c, x: with_gps(c, scale=x), 0.9501, 0.9499,
@@ -303,7 +308,7 @@ def test_a_finding_states_the_limit_that_was_passed() -> None:
     for agreeing, limit in ((0.3, "0.35"), (0.1, "0.15")):
         (objection,) = judge(with_part(made(), "held_out", agreeing=agreeing)).objections
         assert objection.found.endswith(f": {agreeing}, expected at least {limit}")
-    (objection,) = judge(with_gps(made(), median=14.0)).objections
+    (objection,) = judge(with_gps(made(), local=14.0)).objections
     assert objection.found.endswith(": 14 m, expected at most 12")
     for part, limit in (("misalignment", "0.095"), ("by_all", "0.08")):
         wide = with_part(made(), part, rotation=Interval(0.04, 0.0, 0.3))
@@ -607,7 +612,7 @@ def test_a_row_that_is_not_proven_is_told_what_to_photograph() -> None:
     verdict = judge(with_period(few, in_three=0.4))
     assert found(verdict) == [("in_three", "doubtful"), ("tied", "doubtful")]
     assert "Period May 2017: share of the points" in verdict.text
-    for words in ("steps half as long", "second pass", "to the side", "loops"):
+    for words in ("steps half as long", "second pass", "diagonally ahead", "loops"):
         assert words in verdict.todo[0]
     assert "from where the photos of the other date were taken" in verdict.todo[1]
     failed = judge(with_period(with_part(made(), "held_out", agreeing=0.1), in_three=0.4))

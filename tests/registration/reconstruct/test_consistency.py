@@ -1,12 +1,14 @@
 """Images whose matches contradict their poses."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import verified_matches
@@ -14,10 +16,17 @@ from chronoscene.registration.reconstruct.consistency import (
     MIN_MATCHES,
     agreement,
     deregister_misplaced,
+    loose_parts,
     misplaced,
     pair_agreements,
+    point_agreements,
 )
-from chronoscene.registration.reconstruct.models import known_images, set_pose
+from chronoscene.registration.reconstruct.gps_alignment import Priors
+from chronoscene.registration.reconstruct.mapping import Task, triangulate
+from chronoscene.registration.reconstruct.models import known_images, set_pose, set_poses
+from chronoscene.registration.reconstruct.routes import rejoined
+from chronoscene.scene.geometry import look_at
+from chronoscene.scene.similarity import fit_robustly
 
 
 def agreements(groups: list[int], false_edges: int, seed: int) -> dict[tuple[int, int], Any]:
@@ -47,6 +56,23 @@ def test_a_group_that_agrees_with_itself_alone_is_found(
 @given(st.integers(2, 30), st.integers(0, 10**6))
 def test_where_all_agree_none_is_misplaced(count: int, seed: int) -> None:
     assert misplaced(agreements([count], 0, seed), range(count)) == []
+
+
+@given(st.integers(6, 25), st.integers(3, 5), st.integers(0, 1), st.integers(0, 10**6))
+def test_a_part_that_most_matches_contradict_is_loose(
+    right: int, wrong: int, false_edges: int, seed: int
+) -> None:
+    found = agreements([right, wrong], false_edges, seed)
+    part, every = set(range(right, right + wrong)), range(right + wrong)
+    loose = set(loose_parts(found, every))
+    assert loose >= part and len(loose - part) <= false_edges  # what hangs on a false edge
+    others = set(loose_parts(found, every, trusted=part))
+    assert others <= set(range(right)) and len(others) >= right - false_edges
+
+
+@given(st.integers(2, 30), st.integers(0, 10**6))
+def test_where_all_agree_no_part_is_loose(count: int, seed: int) -> None:
+    assert loose_parts(agreements([count], 0, seed), range(count)) == []
 
 
 def test_halves_that_contradict_each_other_are_left() -> None:
@@ -102,3 +128,45 @@ def test_poses_that_were_spoiled_are_taken_out(
     assert set(model.reg_image_ids()) == every - set(spoiled)
     assert len(remarks) == min(len(moved), 1)
     assert all(name in remarks[0] for name in names)
+
+
+@pytest.mark.parametrize("gps", [False, True])
+def test_a_part_of_another_size_is_found_and_placed_again(
+    tmp_path: Path, write_database: Callable[..., Any], gps: bool
+) -> None:
+    """A row of photos whose end is scaled about one of them, so that pairs with it still agree."""
+    rng = np.random.default_rng(2)
+    ground = np.column_stack([rng.uniform(-40, 150, 3000), rng.uniform(-35, 35, 3000)])
+    points = np.column_stack([ground, rng.uniform(-5, 5, 3000)])
+    places = np.array([[8.0 * i, rng.normal(0, 2), 50.0] for i in range(14)])
+    right = [look_at(p, np.array([p[0], 0.0, 0.0])) for p in places]
+    camera = pycolmap.Camera(model="PINHOLE", width=1000, height=750, params=[800, 800, 500, 375])
+    sees = [rng.uniform(size=3000) < 0.7 for _ in right]
+    task = Task.start(write_database(tmp_path, right, points, sees, camera), lambda *_: None)
+    _, matches = verified_matches(task.database)
+    names = [f"{i:02d}.jpg" for i in range(14)]
+
+    def model_at(centres: NDArray[np.float64]) -> pycolmap.Reconstruction:
+        model = known_images(task.database)
+        turns = [pose[:3, :3] for pose in right]
+        poses = [np.column_stack([r, -r @ c]) for r, c in zip(turns, centres, strict=True)]
+        set_poses(model, dict(zip(names, poses, strict=True)))
+        return triangulate(model, task, "")
+
+    def loose(model: pycolmap.Reconstruction) -> list[str]:
+        found = loose_parts(point_agreements(model, matches), model.reg_image_ids())
+        return [str(model.images[i].name) for i in found]
+
+    assert loose(model_at(places)) == []
+    wrong = places.copy()
+    wrong[9:] = places[8] + 0.6 * (places[9:] - places[8])
+    model = model_at(wrong)
+    assert loose(model) == names[9:]
+    enu = {n: list(p + rng.normal(0, 0.5, 3)) for n, p in zip(names, places, strict=True)}
+    priors = Priors(enu if gps else {}, dict.fromkeys(enu, [0.5] * 3) if gps else {})
+    again = rejoined(model, matches, priors, task)
+    assert loose(again) == []
+    assert len(task.remarks) > 0 and "where it is now" in task.remarks[-1]
+    centres = {str(i.name): i.projection_center() for i in again.images.values()}
+    error = fit_robustly(np.array([centres[n] for n in names]), places)
+    assert error is not None and error[1].max() < 0.3
