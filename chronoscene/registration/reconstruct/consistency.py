@@ -176,33 +176,29 @@ def _grown(good: Ints, total: Ints, start: Mask) -> Mask:
         agreeing, known = agreeing + good[new], known + total[new]
 
 
-def loose_parts(
-    agreements: Agreements, images: Collection[int], trusted: Collection[int] = ()
-) -> list[int]:
+def loose_parts(agreements: Agreements, images: Collection[int]) -> list[int]:
     """Images of parts that most matches with the rest of a model contradict.
 
     The pairs with most agreeing matches hold the model together as a tree. Each of its edges holds
     a part, and all matches across that part are counted. Of the parts that fewer than `MIN_LINK`
-    of them hold, the one that most contradict is taken out, then that of the rest.
+    of them hold, the one that most contradict is taken out, then that of the rest. The larger side
+    of an edge counts as right.
 
     Args:
         agreements: From `point_agreements`.
         images: Ids of the posed images.
-        trusted: Ids that are right by definition; without any, the larger part is right.
 
     Returns:
         Ids, sorted.
     """
     left, loose = sorted(images), set[int]()
-    while part := loosest_part(agreements, left, trusted):
+    while part := loosest_part(agreements, left):
         loose |= part
         left = [i for i in left if i not in part]
     return sorted(loose)
 
 
-def loosest_part(
-    agreements: Agreements, ids: Sequence[int], trusted: Collection[int] = ()
-) -> set[int]:
+def loosest_part(agreements: Agreements, ids: Sequence[int]) -> set[int]:
     """The part that most matches contradict; empty if all are held. See `loose_parts`."""
     if len(ids) < 2 * MIN_PART:
         return set()
@@ -213,14 +209,9 @@ def loosest_part(
     for k in order[:0:-1]:
         parts[above[k]] |= parts[k]
     parts = parts[order[1:]]
-    certain = np.isin(ids, list(trusted))
-    wrong_side = (
-        (parts & certain).any(axis=1) if certain.any() else 2 * parts.sum(axis=1) > len(ids)
-    )
-    parts ^= wrong_side[:, None]
+    parts ^= (2 * parts.sum(axis=1) > len(ids))[:, None]
     agreeing, judged = (((parts @ counts) * ~parts).sum(axis=1) for counts in (good, total))
-    large = np.minimum(parts.sum(axis=1), (~parts).sum(axis=1)) >= MIN_PART
-    usable = large & (judged >= MIN_MATCHES) & ~(parts & certain).any(axis=1)
+    usable = (parts.sum(axis=1) >= MIN_PART) & (judged >= MIN_MATCHES)
     against = np.where(usable & (agreeing < MIN_LINK * judged), judged - agreeing, 0)
     if not against.any():
         return set()
