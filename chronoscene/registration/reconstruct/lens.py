@@ -2,14 +2,11 @@
 
 Photos are mapped with one coefficient of distortion, which few photos determine. What it leaves of
 the distortion of a lens bends a scene and shifts focal length and height, so a model of many photos
-is adjusted again with all coefficients. Whether these gain anything shows on a part of the photos,
-where there are many more.
+is adjusted again with all coefficients.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,13 +17,8 @@ from chronoscene.registration.features.database import copy_with_cameras
 from chronoscene.registration.photos.stated import contradicts
 from chronoscene.registration.reconstruct.focal import Focals, stated_focals
 from chronoscene.registration.reconstruct.mapping import Task, adjust, triangulate
-from chronoscene.registration.reconstruct.models import only
 
 MIN_GAIN = 0.02  # Share by which the median reprojection error must shrink
-
-TRIED = 30
-"""Images of each camera on which all coefficients are tried first. An adjustment takes the third
-power of the number of images where these show one place."""
 
 
 def with_full_lens(
@@ -49,15 +41,9 @@ def with_full_lens(
         return model
     before = _error(model)
     free = replace(task, held=False)
-    if (part := _part(model, many)) is not None:
-        adjust(part, task)
-        if not _gains(_adjusted(part, free, many), _error(part)):
-            images = part.num_reg_images()
-            task.remarks.append(f"more coefficients of the lens gain nothing on {images} images")
-            return model
     for attempt in (free, task) if task.held else (free,):
         found = _adjusted(model, attempt, many)
-        if not _gains(found, before):
+        if _error(found) > (1 - MIN_GAIN) * before:
             task.remarks.append("more coefficients of the lens gain nothing")
             return model
         stated = stated_focals(found, focals)
@@ -74,29 +60,6 @@ def with_full_lens(
             task.held = attempt.held
             return found
     return model
-
-
-def _part(model: pycolmap.Reconstruction, cameras: Sequence[int]) -> pycolmap.Reconstruction | None:
-    """Neighbouring images of each camera, or None where they would be most of the model."""
-    ids = list(model.reg_image_ids())
-    if 2 * TRIED * len(cameras) > len(ids):
-        return None
-    kept: set[int] = set()
-    for camera_id in cameras:
-        own = [i for i in ids if model.images[i].camera_id == camera_id]
-        first = max(own, key=lambda i: model.images[i].num_points3D)
-        shared = Counter(
-            element.image_id
-            for point in model.images[first].points2D
-            if point.has_point3D()
-            for element in model.points3D[point.point3D_id].track.elements
-        )
-        kept |= set(sorted(own, key=lambda i: -shared[i])[:TRIED])
-    return only(model, kept)
-
-
-def _gains(found: pycolmap.Reconstruction, before: float) -> bool:
-    return _error(found) <= (1 - MIN_GAIN) * before
 
 
 def _adjusted(

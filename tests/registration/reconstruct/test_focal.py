@@ -99,24 +99,6 @@ def test_a_full_model_of_the_lens_gives_focal_length_and_height(
     assert any("all coefficients of the lens" in r for r in result["remarks"])
 
 
-@pytest.mark.parametrize(
-    ("lens", "remark"),
-    [
-        (LENS, "all coefficients of the lens: focal length"),
-        ((-0.02, 0.0, 0.0, 0.0), "more coefficients of the lens gain nothing on 5 images"),
-    ],
-)
-def test_the_lens_of_many_photos_is_tried_on_some_of_them(
-    tmp_path: Path, write_database: Callable[..., Any], monkeypatch: pytest.MonkeyPatch,
-    lens: tuple[float, ...], remark: str,
-) -> None:  # fmt: skip
-    monkeypatch.setattr("chronoscene.registration.reconstruct.lens.MIN_PHOTOS", 12)
-    monkeypatch.setattr("chronoscene.registration.reconstruct.lens.TRIED", 5)
-    case = flight(write_database, tmp_path, "SIMPLE_RADIAL", lens, FOCAL)
-    result = joint(case | {"full_lens": True}, silent)
-    assert any(remark in r for r in result["remarks"]), result["remarks"]
-
-
 def test_a_wrong_focal_length_in_the_metadata_does_no_harm(make_case: Callable[..., Any]) -> None:
     case = make_case(points=150)
     camera = read_camera(case.database)
