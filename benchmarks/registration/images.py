@@ -6,7 +6,7 @@ import argparse
 import shutil
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -179,10 +179,8 @@ def _render(case: ImageCase, folder: Path, seed: int) -> Scene:
             kind=case.kind, periods=case.periods, width=case.width, height=case.height,
             views=case.views, points=2000, blocks=case.blocks, seed=seed, rebuilt=case.rebuilt,
         )  # fmt: skip
-        with ExitStack() as patches:
-            if case.passes:
-                walk = partial(_around_a_block, passes=case.passes)
-                patches.enter_context(patch("chronoscene.synth.flights._walk", walk))
+        walk = partial(_around_a_block, passes=case.passes)
+        with patch("chronoscene.synth.flights._walk", walk) if case.passes else nullcontext():
             generate(folder, settings, truth=False)
     return read_scene(folder)
 

@@ -152,8 +152,8 @@ def rejoined(
     model: pycolmap.Reconstruction, matches: Matches, priors: Priors, task: Task
 ) -> pycolmap.Reconstruction:
     """Place parts that most matches contradict again, by matches or GPS, if that helps."""
+    agreements = point_agreements(model, matches)
     for _ in range(ATTEMPTS):
-        agreements = point_agreements(model, matches)
         ids = sorted(model.reg_image_ids())
         part = loosest_part(agreements, ids)
         if not part:
@@ -171,11 +171,12 @@ def rejoined(
             task.remarks.append(f"{remark}; neither matches nor GPS place it elsewhere")
             break
         found = _adjusted_in_rounds(combined.model, task)
-        after = share_across(point_agreements(found, matches), part)
+        again = point_agreements(found, matches)
+        after = share_across(again, part)
         if after < max(before, MIN_LINK):
             task.remarks.append(f"{remark}, and {after:.0%} where it was placed again: left")
             break
-        model = found
+        model, agreements = found, again
         task.remarks.extend([*combined.remarks, f"{remark}, and {after:.0%} where it is now"])
     return model
 
