@@ -2,7 +2,8 @@
 
     python -m benchmarks.registration.accuracy observations [--cases 300] [--seed 0] [--only FAMILY]
         [--save FILE] [--before FILE]
-    python -m benchmarks.registration.accuracy images [--only NAME] [--work FOLDER] [--route joint]
+    python -m benchmarks.registration.accuracy images [--seed 0] [--only NAME] [--work FOLDER]
+        [--route joint]
     python -m benchmarks.registration.accuracy photos FOLDER... [--work FOLDER] [--route joint]
 
 ``observations`` generates matches and poses without images (`generated.py`), in
@@ -184,7 +185,7 @@ def main() -> None:
     parser.add_argument("tier", choices=("observations", "images", "photos"))
     parser.add_argument("folders", nargs="*", type=Path, help="photos: folders with images/")
     parser.add_argument("--cases", type=int)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="images: added to that of each case")
     parser.add_argument("--only", default="", help="families or cases whose name has this in it")
     parser.add_argument("--route", default="all", help="one of the routes, or all")
     parser.add_argument("--work", type=Path, help="folder that keeps scenes and models")

@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from unittest.mock import patch
@@ -95,6 +95,7 @@ def run_images(options: argparse.Namespace) -> list[shared.Outcome]:
     routes = shared.ROUTES if options.route == "all" else (options.route,)
     with shared.work_folder(options.work) as work:
         for case in [c for c in CASES if options.only in c.name][: options.cases]:
+            case = replace(case, seed=case.seed + options.seed)
             folder = work / case.folder
             truth = make_photos(case, folder)
             outcomes += [_run_case(case, folder, truth, route) for route in routes]
