@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from chronoscene.errors import ConfigError
-from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.staging import is_stream, write_text_atomic
 from chronoscene.io.tables import FORMATS
 from chronoscene.io.wording import printable, printable_lines
 
@@ -106,7 +106,7 @@ def check_file(option: str, file: Path | None) -> None:
     Raises:
         ConfigError: If it cannot.
     """
-    if file is None:
+    if file is None or is_stream(file):
         return
     with writing_to(option, file, expected=A_FILE):
         if file.is_dir():

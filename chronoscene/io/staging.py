@@ -18,6 +18,7 @@ from chronoscene.errors import ConfigError, DiskFullError, SceneError
 from chronoscene.io.documents import plain_file
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # Linux: another one after each start of the machine
+STREAMS = ("/dev", "/dev/fd", "/proc/self/fd")
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}  # Windows has no quotas of this kind
 
 
@@ -109,11 +110,19 @@ def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary name beside a file, renamed to it if the block succeeds, else deleted.
 
     Args:
-        path: The file to write; its folder must exist. Another file of this name is replaced.
+        path: The file to write; its folder must exist. Another file of this name is replaced. A
+            device or pipe (``/dev/stdout``) stays and gets the content.
 
     Raises:
         DiskFullError: If there is no space for it.
     """
+    if is_stream(path):
+        with tempfile.TemporaryDirectory() as folder:
+            content = Path(folder) / "content"
+            yield content
+            with content.open("rb") as source, needing_space(path), path.open("ab") as stream:
+                shutil.copyfileobj(source, stream)
+        return
     partial = path.with_name(partial_name(path.name))
     try:
         with needing_space(path):
@@ -122,6 +131,13 @@ def replacing(path: Path) -> Iterator[Path]:
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def is_stream(path: Path) -> bool:
+    """Tell devices and pipes from files. Links count only where the system keeps its streams."""
+    if str(path.absolute().parent) in STREAMS:
+        return path.exists()
+    return path.exists() and not (path.is_symlink() or path.is_file() or path.is_dir())
 
 
 def write_text_atomic(path: Path, text: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -131,6 +132,16 @@ def test_files_are_looked_at_and_left_alone(tmp_path: Path) -> None:
     for place in (tmp_path, tmp_path / "no/file", tmp_path / "old/file"):
         with pytest.raises(ConfigError, match=r"^--out .*: expected a file that can be written"):
             check_file("--out", place)
+
+
+@pytest.mark.skipif(not Path("/dev/fd").is_dir(), reason="the system has no such folder")
+def test_a_pipe_can_be_the_file() -> None:
+    source, sink = os.pipe()
+    check_file("--out", Path(f"/dev/fd/{sink}"))
+    emit("text\n", Path(f"/dev/fd/{sink}"))
+    os.close(sink)
+    with open(source) as pipe:
+        assert pipe.read() == "text\n"
 
 
 def test_names_that_are_not_text_can_be_written(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import errno
 import os
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -41,6 +42,30 @@ def test_a_block_that_fails_leaves_the_old_file_alone(tmp_path, error):
         raise error
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_a_pipe_stays_and_gets_the_content(tmp_path, monkeypatch):
+    streams, folder = tmp_path / "dev", tmp_path / "run"
+    streams.mkdir()
+    folder.mkdir()
+    pipe = streams / "pipe"
+    os.mkfifo(pipe)
+    monkeypatch.setattr(staging, "STREAMS", (str(streams),))
+    for link in (streams / "stdout", folder / "rows.csv"):
+        link.symlink_to(pipe)
+    for path in (pipe, streams / "stdout"):
+        with ThreadPoolExecutor() as pool:
+            read = pool.submit(pipe.read_bytes)
+            write_text_atomic(path, "text\n")
+        assert read.result(timeout=10) == b"text\n"
+    with pytest.raises(ValueError), replacing(pipe):
+        raise ValueError
+    # A link that came with a folder, on the other hand, is replaced and not followed.
+    write_text_atomic(folder / "rows.csv", "text\n")
+    assert not (folder / "rows.csv").is_symlink()
+    assert sorted(p.name for p in streams.iterdir()) == ["pipe", "stdout"]
+    assert pipe.is_fifo()
 
 
 def test_a_file_that_cannot_be_put_in_place_leaves_nothing(tmp_path):

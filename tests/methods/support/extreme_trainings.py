@@ -205,12 +205,13 @@ def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
 def make_config(extreme: Extreme, spec: MethodSpec, preset: str) -> Any:
     """The preset with its whole schedule in few steps, and other learning rates, if so wanted."""
     options = {f.name for f in dataclasses.fields(import_object(spec.config))}
-    interval = "density_interval" if "density_interval" in options else "densify_interval"
-    overrides = {"iterations": extreme.steps, interval: max(1, extreme.steps // ROUNDS)}
+    overrides: dict[str, Any] = {"iterations": extreme.steps}
+    for interval in options & {"density_interval", "densify_interval"}:
+        overrides[interval] = max(1, extreme.steps // ROUNDS)
     if "stretch" in options:
         overrides["stretch"] = True
     config = build_config(spec, preset=preset, overrides=overrides)
-    rates = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if "_lr" in f.name}
+    rates = {name: getattr(config, name) for name in options if "_lr" in name or "_rate" in name}
     return dataclasses.replace(
         config,
         **{
