@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 import click
@@ -137,6 +138,7 @@ def main() -> None:
 
     SIGTERM ends a command like an interruption, so that it cleans up.
     """
+    _open_streams()
     try:
         with stoppable():
             status = cli.main(prog_name="chronoscene", standalone_mode=False)
@@ -154,6 +156,15 @@ def main() -> None:
             _end(str(full))
         place = f"{error.filename}: " if error.filename else ""
         _end(f"{place}{error.strerror or error}; what was finished before is kept")
+
+
+def _open_streams() -> None:
+    """Open standard streams that the caller closed, or the next file would be one of them."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            number = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(number, True)
+            setattr(sys, name, os.fdopen(number, mode, encoding="utf-8"))
 
 
 def _end(message: str) -> None:

@@ -90,6 +90,16 @@ def test_a_command_that_is_asked_to_end_leaves_nothing_behind(tmp_path):
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs a shell of POSIX")
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_standard_streams_may_be_closed(make_scene_folder, tmp_path, closed):
+    command = f"{sys.executable} -m chronoscene stats {make_scene_folder()}"
+    result = subprocess.run(["sh", "-c", f"{command} {closed}"], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr in ("measure scenes\n", "")
+    assert ("Period" in result.stdout) == (">&-" not in closed.split())
+
+
 def test_dataset_commands_work_without_what_windows_lacks(make_scene_folder, tmp_path):
     scene = make_scene_folder()
     code = """
