@@ -59,10 +59,15 @@ def judged(
 ) -> Outcome:
     """Compare a registration with the truth [N, 4, 4], where that is known. [N]"""
     where = np.ones(len(truth), bool) if where is None else where
-    rotation, centre = pose_errors(model.cam_from_world, truth, where & (model.periods == 0))
-    depth = true_depth(model, truth, where & (model.periods == 0))
+    reason = verdict.objections[0].check if verdict.objections else ""
+    reference = where & (model.periods == 0)
+    if not reference.any():  # nothing to compare the other periods with
+        wrong = ((np.inf,) * 4,) * (model.num_periods - 1)
+        return Outcome(family, route, wrong, verdict.level, reason, seconds)
+    rotation, centre = pose_errors(model.cam_from_world, truth, reference)
+    depth = true_depth(model, truth, reference)
     extent = max(true_extent(truth[where]), depth)
-    first = _spread(model, truth, where & (model.periods == 0))
+    first = _spread(model, truth, reference)
     rows = []
     for p in range(1, model.num_periods):
         mine = where & (model.periods == p)
@@ -72,7 +77,6 @@ def judged(
         r, c = rotation[mine], 100 * centre[mine] / extent
         deep = 100 * depth * abs(_spread(model, truth, mine) / first - 1) / extent
         rows.append((np.median(r), r.max(), max(np.median(c), deep), max(c.max(), deep)))
-    reason = verdict.objections[0].check if verdict.objections else ""
     return Outcome(family, route, tuple(rows), verdict.level, reason, seconds)
 
 
