@@ -27,6 +27,8 @@ REFUSED = "refused"
 ROTATION, CENTRE = 0.1, 0.2
 """Degrees, and percent of the extent, within which a registration is right."""
 
+ABSENT = (np.inf,) * 4  # Errors of a period without a pose
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -62,7 +64,7 @@ def judged(
     reason = verdict.objections[0].check if verdict.objections else ""
     reference = where & (model.periods == 0)
     if not reference.any():  # nothing to compare the other periods with
-        wrong = ((np.inf,) * 4,) * (model.num_periods - 1)
+        wrong = (ABSENT,) * (model.num_periods - 1)
         return Outcome(family, route, wrong, verdict.level, reason, seconds)
     rotation, centre = pose_errors(model.cam_from_world, truth, reference)
     depth = true_depth(model, truth, reference)
@@ -72,7 +74,7 @@ def judged(
     for p in range(1, model.num_periods):
         mine = where & (model.periods == p)
         if not mine.any():
-            rows.append((np.inf,) * 4)
+            rows.append(ABSENT)
             continue
         r, c = rotation[mine], 100 * centre[mine] / extent
         deep = 100 * depth * abs(_spread(model, truth, mine) / first - 1) / extent
@@ -82,7 +84,7 @@ def judged(
 
 def refused(family: str, route: str, periods: int, seconds: float) -> Outcome:
     """A command that ended with a message instead of a registration."""
-    return Outcome(family, route, ((np.inf,) * 4,) * (periods - 1), REFUSED, "", seconds)
+    return Outcome(family, route, (ABSENT,) * (periods - 1), REFUSED, "", seconds)
 
 
 def save(outcomes: list[Outcome], file: Path) -> None:

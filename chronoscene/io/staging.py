@@ -18,7 +18,7 @@ from chronoscene.errors import ConfigError, DiskFullError, SceneError
 from chronoscene.io.documents import plain_file
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # Linux: another one after each start of the machine
-STREAMS = ("/dev", "/dev/fd", "/proc/self/fd")
+STREAMS = ("/dev", "/dev/fd", "/proc/self/fd")  # Folders of the system; nobody plants links there
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}  # Windows has no quotas of this kind
 
 

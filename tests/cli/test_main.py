@@ -92,7 +92,7 @@ def test_a_command_that_is_asked_to_end_leaves_nothing_behind(tmp_path):
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a shell of POSIX")
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
-def test_standard_streams_may_be_closed(make_scene_folder, tmp_path, closed):
+def test_standard_streams_may_be_closed(make_scene_folder, closed):
     command = f"{sys.executable} -m chronoscene stats {make_scene_folder()}"
     result = subprocess.run(["sh", "-c", f"{command} {closed}"], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr

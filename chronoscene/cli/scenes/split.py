@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from chronoscene.cli.options import PATH, reading_options
-from chronoscene.cli.output import check_place, emit, writing_to
+from chronoscene.cli.output import A_FILE, check_place, emit, writing_to
 from chronoscene.cli.progress import announce, progress_bar
 from chronoscene.cli.scenes.reading import describe_period, read_and_note
 from chronoscene.errors import ConfigError
@@ -140,7 +140,7 @@ def _json_beside(out: Path) -> Path:
 def _write(split: NewSplit, out: Path, option: str) -> None:
     names = "".join(f"{f.name}\n" for f in split.scene.select(split="test"))
     record = json.dumps(split.record(), indent=1, ensure_ascii=False) + "\n"
-    with writing_to(option, out, expected="a file that can be written"):
+    with writing_to(option, out, expected=A_FILE):
         out.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(out, names)
         write_text_atomic(_json_beside(out), record)
