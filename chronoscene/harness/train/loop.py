@@ -31,6 +31,9 @@ NOT_FINITE_LIMIT = 50
 """Steps in a row without a finite loss and finite gradients that end a training; one of several
 views counts as so many."""
 
+BLANK_PSNR = 20.0
+"""dB; photos that are closer to a blank image are blank themselves, such as those of a night."""
+
 _REMEDY = (
     "lower the learning rates, or take preset paper-scaled instead of paper, if the method has "
     "one, or report this with the scene"
@@ -152,7 +155,8 @@ def train(
     Raises:
         DivergedError: If the method skipped too many steps in a row.
         TrainingError: If it took as many steps with a loss that is not finite, no view shows the
-            model any more, no view ever did, or nothing is left of it.
+            model any more, no view ever did, nothing is left of it, or all probe views are blank in
+            the end.
         CheckpointError: If all checkpoints are damaged.
         MethodError: If the method returns a wrong type or value.
     """
@@ -197,14 +201,18 @@ def train(
         if report.primitives == 0:
             raise _untrainable(part, state, "a model with something in it", "nothing left")
         if _is_lost(unseen, state):
-            raise _lost(part, state.iterations, len(unseen))
+            found = f"{len(unseen)} steps in a row without, and a larger loss than at the start"
+            raise _lost(part, state.iterations, "a training view", found)
         if state.empty_steps == state.iterations and (done >= 1.0 or len(unseen) == unseen.maxlen):
             found = f"none in {state.iterations} steps"
             raise _untrainable(part, state, "a training view that shows something of it", found)
         if due and done >= due[0]:
             due = [share for share in due if share > done]
-            state.curve.append(_probe(method, part, truth, state))
-            latest = state.curve[-1].psnr
+            point, is_blank = _probe(method, part, truth, state)
+            state.curve.append(point)
+            latest = point.psnr
+            if is_blank and done >= 1.0:
+                raise _lost(part, state.iterations, "a test view", "nothing but black or white")
         observer(state.iterations, state.seconds, report, latest)
         if checkpoints is not None and checkpoints.is_due and last_good == state.iterations:
             checkpoints.write(method, state)
@@ -259,24 +267,31 @@ def _untrainable(part: Part, state: LoopState, expected: str, found: str) -> Tra
     )
 
 
-def _lost(part: Part, iteration: int, count: int) -> TrainingError:
+def _lost(part: Part, iteration: int, view: str, found: str) -> TrainingError:
     return TrainingError(
         f"model {part.name}, iteration {iteration}",
-        expected="a training view that shows something of the model",
-        found=f"{count} steps in a row without, and a larger loss than at the start",
+        expected=f"{view} that shows something of the model",
+        found=found,
         todo=_REMEDY,
     )
 
 
-def _probe(method: Method, part: Part, truth: Truth, state: LoopState) -> CurvePoint:
+def _probe(method: Method, part: Part, truth: Truth, state: LoopState) -> tuple[CurvePoint, bool]:
+    """Render the probe views; also return True if they are blank and the photos are not.
+
+    A radiance field whose colours are saturated is as large as before: only its images tell.
+    """
     frames = [f for f in probe_frames(part) if f.name in truth]
-    values = [psnr(render_bytes(method, part, f), *truth[f.name]) for f in frames]
+    images = [render_bytes(method, part, f) for f in frames]
+    values = [psnr(image, *truth[f.name]) for image, f in zip(images, frames, strict=True)]
     size = method.size()
     check_size(size, f"model {part.name}")
     mean = float(np.mean(values)) if values else math.nan
-    return CurvePoint(
+    point = CurvePoint(
         state.seconds, state.iterations, size.primitives, mean, size.parameters, part.name
     )
+    blank = all(image.min() == image.max() and image.flat[0] in (0, 255) for image in images)
+    return point, blank and mean < BLANK_PSNR
 
 
 def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:

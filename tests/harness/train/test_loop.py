@@ -269,6 +269,28 @@ def test_a_model_with_nothing_in_it_is_no_result(part):
         run(reporting({7}, 0.1, None, primitives=0), part, StopRule(20, None))
 
 
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_model_that_is_blank_in_the_end_is_no_result(part, level):
+    """But not where the photos are blank, too, nor where a view shows something."""
+    method, stop = toy(rate=0.0), StopRule(20, None)
+    setup = method.setup
+
+    def blank(train, **options):
+        setup(train, **options)
+        method.colors[:] = level / 255
+
+    method.setup = blank
+    message = "iteration 20: expected a test view that shows .* found nothing but black or white"
+    with pytest.raises(TrainingError, match=message):
+        run(method, part, stop)
+    photo = np.full_like(part.store.load(part.test[0]), level)
+    truth = {frame.name: (photo, None) for frame in part.test}
+    options = {"seed": 0, "device": "cpu", "observer": lambda *step: None}
+    assert train(method, part, stop, truth, **options).iterations == 20
+    method.setup = setup
+    assert run(method, part, stop).iterations == 20
+
+
 def test_images_that_are_not_finite_are_refused(part):
     with pytest.raises(MethodError, match=r"Prediction\.rgb: .* values that are not finite"):
         run(toy("BadImage"), part, StopRule(20, None))

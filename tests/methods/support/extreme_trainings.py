@@ -245,7 +245,7 @@ def run(extreme: Extreme, spec: MethodSpec, preset: str) -> Outcome:
             method,
             part,
             StopRule(extreme.steps, None),
-            {},
+            {f.name: (part.store.load(f), None) for f in part.test},
             seed=0,
             device="cpu",
             observer=lambda done, seconds, report, probe: reports.append(report),
