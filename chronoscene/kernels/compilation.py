@@ -33,8 +33,7 @@ def inner(
     Args:
         function: What to compile; without one, the decorator for these options is returned.
         fast_math: Whether scalar arithmetic may round as `FAST_MATH` says.
-        options: Others of `numba.njit`; with ``forceinline``, references to the arrays of a tuple
-            are not counted at each call, which takes longer than a short function.
+        options: Others of `numba.njit`.
     """
     if function is None:
         return lambda function: inner(function, fast_math=fast_math, **options)

@@ -158,7 +158,7 @@ class Probes(NamedTuple):
     """0 inside objects, else 1. [X, Y, Z]"""
 
 
-@inner(forceinline=True)
+@inner
 def probe_light(probes, p, d, slope):  # type: ignore[no-untyped-def]
     """Indirect radiance at a point from a direction; ``slope`` 2/3 gives irradiance / pi."""
     nx, ny, nz = probes.valid.shape

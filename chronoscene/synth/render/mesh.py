@@ -291,7 +291,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 MISS = 0xFFFFFFFF  # Triangle of a ray that hits nothing
 
 
-@inner(forceinline=True)
+@inner
 def hit_normals(tables, tri, u, v, d):  # type: ignore[no-untyped-def]
     """Flat and smooth unit normals of a hit; the flat one is turned towards the viewer."""
     a, b, c = tables.vertices[tri, 0], tables.vertices[tri, 1], tables.vertices[tri, 2]

@@ -332,7 +332,7 @@ def _corner(corners, tri, k):
     )
 
 
-@inner(forceinline=True)
+@inner
 def _hit(corners, tri, origin, d):
     """Parameter at which a ray hits a triangle, infinity for none, and barycentric coordinates.
 

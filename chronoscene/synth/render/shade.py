@@ -114,7 +114,7 @@ def _direction(ray):  # type: ignore[no-untyped-def]
     return d, math.sqrt(dot(d, d))
 
 
-@inner(forceinline=True)
+@inner
 def _base(ray, t, tri, u, v, tables, fw_unit):  # type: ignore[no-untyped-def]
     """Albedo of a hit for samples of the given width at unit distance."""
     d, length = _direction(ray)
@@ -125,7 +125,7 @@ def _base(ray, t, tri, u, v, tables, fw_unit):  # type: ignore[no-untyped-def]
     return surface_albedo(tables, tri, x, y, z, fw)
 
 
-@inner(forceinline=True)
+@inner
 def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignore[no-untyped-def]
     """Radiance along a ray that hit a surface of albedo ``base``; ``lit`` is 0..1."""
     step, length = _direction(ray)
