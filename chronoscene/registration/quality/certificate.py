@@ -15,7 +15,7 @@ import numpy as np
 from chronoscene.arrays import Array, Mask
 from chronoscene.registration.features import METHOD
 from chronoscene.registration.quality.disagreement import Disagreement, disagreement
-from chronoscene.registration.quality.gps_fit import PeriodGpsFit, fit_gps
+from chronoscene.registration.quality.gps_fit import PeriodGpsFit, displaced_parts, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
     MAX_SEEN,
@@ -65,6 +65,8 @@ class PeriodFigures:
     """Share of the points that its images see that three images or more see, of whatever date."""
     loose: tuple[str, ...] = ()
     """Images in parts of the model that most matches with the rest contradict, sorted."""
+    elsewhere: tuple[str, ...] = ()
+    """Images in parts of the model that GPS places elsewhere (`displaced_parts`), sorted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +153,9 @@ def certify(model: Registered) -> Certificate:
     evidence = gather(model)
     cells = ground_plan(model.points)
     focals = [np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in model.cameras]
+    elsewhere = np.zeros(len(model.names), bool)
+    if model.georeference is not None:
+        elsewhere = displaced_parts(camera_centre(model.cam_from_world), model.gps_enu)
     return Certificate(
         route=model.route,
         features=model.features,
@@ -160,7 +165,7 @@ def certify(model: Registered) -> Certificate:
         facing=_span(model) < extent,
         focal=float(np.median(focals)) if focals else float("nan"),
         labels=tuple(model.labels),
-        periods=tuple(_period(model, evidence, p) for p in range(model.num_periods)),
+        periods=tuple(_period(model, evidence, p, elsewhere) for p in range(model.num_periods)),
         pairs=tuple(
             _pair(model, evidence, (a, b), tie_spread(model, evidence.seen, a, b, cells))
             for a, b in combinations(range(model.num_periods), 2)
@@ -197,7 +202,7 @@ def _span(model: Registered) -> float:
     return float(np.linalg.norm(np.ptp(camera_centre(model.cam_from_world), axis=0)))
 
 
-def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures:
+def _period(model: Registered, evidence: Evidence, period: int, elsewhere: Mask) -> PeriodFigures:
     mine = model.periods == period
     missing = [n for n, p in model.unregistered_periods.items() if p == period]
     reasons = Counter(model.unregistered.get(name, "unknown") for name in missing)
@@ -218,6 +223,7 @@ def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures
         gps=gps,
         in_three=_in_three(model, evidence.seen[:, period]),
         loose=tuple(n for n, i in zip(model.names, mine, strict=True) if i and n in model.loose),
+        elsewhere=tuple(model.names[i] for i in np.flatnonzero(mine & elsewhere)),
     )
 
 

@@ -7,12 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Mask
 from chronoscene.scene.similarity import SIGMA, fit_robustly
 
 MIN_POSITIONS = 4  # Positions that a period needs
 NEIGHBOURS = 15
 """Cameras in one place whose median counts: more than half of them are hardly ever outliers."""
+
+PART = 3  # Neighbouring cameras that make a part
+NEAREST = 6  # Cameras in one place, for parts
+ELSEWHERE = 30.0
+"""Metres from a camera to its GPS, horizontally, that no error of a receiver explains which several
+photos in a row share."""
+ALIKE = 0.25
+"""Distance between displacements of one part, relative to them."""
 
 SPREAD_FACTOR = 3.0
 """The positions of a period must spread over this many times the error of the receiver."""
@@ -78,6 +86,26 @@ def fit_gps(centres: Array, gps: Array) -> PeriodGpsFit | str:
         offset=offset,
         offset_error=error,
     )
+
+
+def displaced_parts(centres: Array, gps: Array) -> Mask:
+    """Find the cameras of parts of the model that GPS places elsewhere, all by one displacement.
+
+    Gross errors of a receiver differ from photo to photo, unless it repeats an old position.
+
+    Args:
+        centres: In the frame of the model, which is east, north, up in metres. [N, 3]
+        gps: NaN where there is none. [N, 3]
+    """
+    away = (gps - centres)[:, :2]
+    far = np.linalg.norm(away, axis=1) > ELSEWHERE
+    count = min(NEAREST, len(centres))
+    if count < PART or not far.any():
+        return np.zeros(len(centres), bool)
+    nearest = cKDTree(centres).query(centres, count)[1]
+    apart = np.linalg.norm(away[nearest] - away[:, None], axis=2)
+    alike = far[nearest] & (apart < ALIKE * np.linalg.norm(away, axis=1)[:, None])
+    return far & (alike.sum(axis=1) >= PART)
 
 
 def _largest_local_median(places: Array, values: Array) -> float:

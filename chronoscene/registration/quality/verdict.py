@@ -193,6 +193,14 @@ THRESHOLDS: dict[str, Threshold] = {
         todo="look at the map on the page (--report); register the period alone to see which "
         "photos deform it",
     ),
+    "gps_part": Threshold(
+        what="photos in parts of the model that GPS places elsewhere",
+        doubtful=0.0,
+        why="where neighbours are 30 m or more from their GPS, all in one direction, the model may "
+        "have them in the wrong place; gross errors of a receiver differ from photo to photo",
+        todo="look at the map on the page (--report); if the GPS is right, photograph the way "
+        "between these photos and the others again, or leave them out",
+    ),
     "gps_scale": Threshold(
         what="scale of a period against its own GPS, beyond its spread",
         unit="%", doubtful=2.0, fail=10.0,
@@ -344,6 +352,9 @@ def _of_period(p: PeriodFigures) -> Iterator[Objection]:
     yield from _check("images", p.registered, place)
     if p.loose:
         yield from _check("loose", len(p.loose), place, f" ({p.loose[0]} to {p.loose[-1]})")
+    if p.elsewhere:
+        note = f" ({p.elsewhere[0]} to {p.elsewhere[-1]})"
+        yield from _check("gps_part", len(p.elsewhere), place, note)
     if isinstance(p.gps, PeriodGpsFit):
         gps = p.gps
         yield from _check("gps_residual", gps.local, place)

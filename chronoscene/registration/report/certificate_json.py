@@ -69,6 +69,7 @@ def period_figures(period: PeriodFigures) -> Iterator[Figure]:
         share, over = 100 * period.in_three, "points that its images see"
         yield Figure("points that three images or more see", share, "%", over)
     yield Figure("images in parts that most matches contradict", len(period.loose), "", photos)
+    yield Figure("images in parts that GPS places elsewhere", len(period.elsewhere), "", photos)
     gps = period.gps
     if not isinstance(gps, PeriodGpsFit):
         yield Figure("GPS residual", None, "m", "", absent=gps)

@@ -17,7 +17,12 @@ from scipy.spatial.transform import Rotation
 from benchmarks.registration.generated import CaseSettings, generate_case, pose_errors
 from chronoscene.registration.quality import certificate as certificate_module
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
-from chronoscene.registration.quality.gps_fit import NEIGHBOURS, PeriodGpsFit, fit_gps
+from chronoscene.registration.quality.gps_fit import (
+    NEIGHBOURS,
+    PeriodGpsFit,
+    displaced_parts,
+    fit_gps,
+)
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment, Motion, Transfers
 from chronoscene.registration.quality.overlap import tie_spread
@@ -504,6 +509,36 @@ def test_a_displaced_part_shows_in_the_gps_of_neighbours(seed: int) -> None:
     fit = fit_gps(places, gps)
     assert isinstance(fit, PeriodGpsFit)
     assert fit.median < THRESHOLDS["gps_residual"].doubtful < fit.local
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_small_part_shows_by_the_direction_to_its_gps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    places = np.c_[np.arange(0, 200, 8.0), rng.normal(0, 2, (25, 2))]
+    gps = places + rng.normal(0, 3.0, places.shape)
+    gross = rng.permutation(25)[:4]
+    gps[gross] += rng.uniform(60, 300, (4, 1)) * np.eye(3)[[0, 1, 0, 1]] * [[1], [1], [-1], [-1]]
+    gps[:, 2] += 80.0  # heights are not judged
+    gps[rng.permutation(25)[0]] = np.nan
+    assert not displaced_parts(places, gps).any()
+    places[[20, 21, 22]] = places[10] + [[0, 1, 0], [1, 1, 0], [2, 1, 0]]
+    gps[[20, 21, 22]] = places[20] + [90.0, 60.0, 0.0] + rng.normal(0, 3.0, (3, 3))
+    assert displaced_parts(places, gps).nonzero()[0].tolist() == [20, 21, 22]
+    assert not displaced_parts(places[20:22], gps[20:22]).any()
+
+
+def test_parts_that_gps_places_elsewhere_belong_to_their_periods(good: Registered) -> None:
+    centres = camera_centre(good.cam_from_world)
+    part = np.argsort(np.linalg.norm(centres - centres[0], axis=1))[:4]
+    gps = good.gps_enu.copy()
+    gps[part] = centres[part] + [80.0, -60.0, 0.0]
+    found = certify(replace(good, gps_enu=gps))
+    named = {name for p in found.periods for name in p.elsewhere}
+    assert named == {good.names[i] for i in part}
+    for period in found.periods:
+        assert all(good.periods[good.names.index(n)] == period.period for n in period.elsewhere)
+    assert {f.level for f in judge(found).objections if f.check == "gps_part"} == {"doubtful"}
+    assert not any(p.elsewhere for p in certify(good).periods)
 
 
 def test_loose_parts_belong_to_their_periods(good: Registered) -> None:

@@ -282,6 +282,10 @@ LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
         lambda c, x: with_gps(c, offset=np.array([x, 0.0, 0.0])), 16.27, 16.28,
     ),
     "loose": ("loose", "doubtful", with_loose, 0, 3),
+    "gps part": (
+        "gps_part", "doubtful",
+        lambda c, x: with_period(c, 1, elsewhere=("1.jpg",) * x), 0, 3,
+    ),
     "gps residual": ("gps_residual", "doubtful", lambda c, x: with_gps(c, local=x), 11.9, 12.1),
     "gps scale": ("gps_scale", "doubtful", lambda c, x: with_gps(c, scale=x), 1.0499, 1.0501),
     "gps scale, small": (
