@@ -17,8 +17,8 @@ NEIGHBOURS = 15
 PART = 3  # Neighbouring cameras that make a part
 NEAREST = 6  # Cameras in one place, for parts
 ELSEWHERE = 30.0
-"""Metres from a camera to its GPS, horizontally, that no error of a receiver explains which several
-photos in a row share."""
+"""Horizontal distance from a camera to its GPS, metres, that neighbouring photos hardly share by
+errors of the receiver."""
 ALIKE = 0.25
 """Distance between displacements of one part, relative to them."""
 
