@@ -98,13 +98,14 @@ def displaced_parts(centres: Array, gps: Array) -> Mask:
         gps: NaN where there is none. [N, 3]
     """
     away = (gps - centres)[:, :2]
-    far = np.linalg.norm(away, axis=1) > ELSEWHERE
+    distance = np.linalg.norm(away, axis=1)
+    far = distance > ELSEWHERE
     count = min(NEAREST, len(centres))
     if count < PART or not far.any():
         return np.zeros(len(centres), bool)
     nearest = cKDTree(centres).query(centres, count)[1]
     apart = np.linalg.norm(away[nearest] - away[:, None], axis=2)
-    alike = far[nearest] & (apart < ALIKE * np.linalg.norm(away, axis=1)[:, None])
+    alike = far[nearest] & (apart < ALIKE * distance[:, None])
     return far & (alike.sum(axis=1) >= PART)
 
 

@@ -350,11 +350,9 @@ def _of_period(p: PeriodFigures) -> Iterator[Objection]:
         far = [reason for reason in p.reasons if reason.endswith(ANOTHER_PLACE)]
         yield replace(found, found=f"{found.found}; {far[0]}", todo=_PLACE) if far else found
     yield from _check("images", p.registered, place)
-    if p.loose:
-        yield from _check("loose", len(p.loose), place, f" ({p.loose[0]} to {p.loose[-1]})")
-    if p.elsewhere:
-        note = f" ({p.elsewhere[0]} to {p.elsewhere[-1]})"
-        yield from _check("gps_part", len(p.elsewhere), place, note)
+    for key, part in (("loose", p.loose), ("gps_part", p.elsewhere)):
+        if part:
+            yield from _check(key, len(part), place, f" ({part[0]} to {part[-1]})")
     if isinstance(p.gps, PeriodGpsFit):
         gps = p.gps
         yield from _check("gps_residual", gps.local, place)
