@@ -37,7 +37,8 @@ from benchmarks.registration.outcomes import REFUSED, Outcome, judged, load, sav
 from benchmarks.registration.photos import run_photos
 from chronoscene.harness.files.provenance import processor_name
 from chronoscene.registration.quality.certificate import certify
-from chronoscene.registration.quality.verdict import LEVELS, judge
+from chronoscene.registration.quality.thresholds import LEVELS
+from chronoscene.registration.quality.verdict import judge
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

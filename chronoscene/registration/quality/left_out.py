@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from chronoscene.arrays import Array
-from chronoscene.registration.quality.verdict import Objection, Threshold, check
+from chronoscene.registration.quality.thresholds import Objection, Threshold, check
 from chronoscene.registration.result import Registered
 
 

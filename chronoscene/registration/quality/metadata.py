@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from chronoscene.registration.photos.stated import contradicts
-from chronoscene.registration.quality.verdict import Objection
+from chronoscene.registration.quality.thresholds import Objection
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
 

@@ -22,7 +22,13 @@ from chronoscene.registration.quality.left_out import (
 )
 from chronoscene.registration.quality.metadata import Comparison, compare_with_metadata
 from chronoscene.registration.quality.metadata import objections as contradictions
-from chronoscene.registration.quality.verdict import Level, Objection, Threshold, check, worst_level
+from chronoscene.registration.quality.thresholds import (
+    Level,
+    Objection,
+    Threshold,
+    check,
+    worst_level,
+)
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.control import CONTRADICTION
 from chronoscene.registration.ties.residuals import PointResidual

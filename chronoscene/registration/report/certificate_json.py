@@ -24,7 +24,8 @@ from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Interval, Misalignment, rotation_angle
 from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position, Rmse
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
-from chronoscene.registration.quality.verdict import THRESHOLDS, Verdict
+from chronoscene.registration.quality.thresholds import THRESHOLDS
+from chronoscene.registration.quality.verdict import Verdict
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 
 FORMAT = "chronoscene-registration-2"

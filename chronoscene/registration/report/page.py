@@ -13,7 +13,8 @@ from chronoscene.arrays import Array
 from chronoscene.io.pages import render_page
 from chronoscene.registration.quality.certificate import Certificate, PairFigures
 from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position
-from chronoscene.registration.quality.verdict import THRESHOLDS, Level, Verdict
+from chronoscene.registration.quality.thresholds import THRESHOLDS, Level
+from chronoscene.registration.quality.verdict import Verdict
 from chronoscene.registration.report.certificate_json import pair_figures, period_figures
 from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos, camera_map
 from chronoscene.registration.report.spots import DrawnPair, Spot, drawn_pairs, spots

@@ -29,7 +29,8 @@ from chronoscene.registration.quality.overlap import tie_spread
 from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position
 from chronoscene.registration.quality.rays import PlacedPoints, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
-from chronoscene.registration.quality.verdict import THRESHOLDS, judge
+from chronoscene.registration.quality.thresholds import THRESHOLDS
+from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.report.certificate_json import pair_figures, period_figures, to_json
 from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene.geometry import camera_centre
