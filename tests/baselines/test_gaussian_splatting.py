@@ -83,10 +83,17 @@ def _due(config):
 
 
 @pytest.mark.parametrize(
-    ("preset", "resets", "rounds"), [("accurate", 1, 39), ("balanced", 1, 15), ("fast", 0, 5)]
+    ("spec", "preset", "resets", "rounds"),
+    [
+        (SPEC, "accurate", 1, 39),
+        (SPEC, "fast", 0, 5),
+        (PERIOD_SPEC, "accurate", 1, 39),
+        (PERIOD_SPEC, "balanced", 1, 15),
+        (PERIOD_SPEC, "fast", 0, 5),
+    ],
 )
-def test_squeezed_schedules_reset_while_there_is_time_to_recover(preset, resets, rounds):
-    due = _due(build_config(PERIOD_SPEC, preset=preset))
+def test_squeezed_schedules_reset_while_there_is_time_to_recover(spec, preset, resets, rounds):
+    due = _due(build_config(spec, preset=preset))
     found = [i for i, d in enumerate(due) if d.reset]
     assert len(found) == resets and sum(d.densify for d in due) == rounds
     for i in found:
