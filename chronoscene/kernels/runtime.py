@@ -19,6 +19,9 @@ CONTAINER = Path("/sys/fs/cgroup")
 GSPLAT_ALPHA_MAX = {"1.5": 0.999, "1.6": 0.99}
 """Cap of alpha in the kernels of gsplat, by version. Others were not looked at and are refused."""
 
+MOST_VIEWS = 4
+"""Views of a step with ``views_per_step=auto``, at most."""
+
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _KEPT_BYTES = 256 << 20
 
@@ -26,6 +29,15 @@ _KEPT_BYTES = 256 << 20
 def available_threads() -> int:
     """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def views_for_threads(threads: int) -> int:
+    """Return the number of views of a training step with ``views_per_step=auto``.
+
+    It is one view up to two threads, where more bring nothing, then a view for every two threads,
+    and `MOST_VIEWS` at most: what more views save is less than what they cost in quality.
+    """
+    return 1 if threads <= 2 else min(threads // 2, MOST_VIEWS)
 
 
 def machine_memory() -> tuple[int, int]:

@@ -38,7 +38,7 @@ class SplattingConfig:
     views_per_step: PositiveInt | Literal["auto"] = 1
     """Training views of one step, which moves the model by the sum of their gradients. Iterations
     count views, so equal iterations mean equally many photos seen. ``auto``: by the number of
-    threads, see `chronoscene.training.views.count_views`; the result then depends on it."""
+    threads, see `chronoscene.kernels.runtime.views_for_threads`; the result then depends on it."""
     random_background: bool = False
     """Train with another colour behind everything in each step, so that no Gaussian is missing
     where a photo shows that colour. Images are rendered with the usual background."""

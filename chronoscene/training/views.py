@@ -12,15 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from chronoscene.kernels.runtime import views_for_threads
 from chronoscene.kernels.thread_pool import num_workers
 from chronoscene.methods import TrainingSet, View
 from chronoscene.methods.interface import nothing_ahead
 from chronoscene.training.devices import to_device
 
 V = TypeVar("V", bound=View)
-
-MOST_VIEWS = 4
-"""Views of a step with ``views_per_step=auto``, at most."""
 
 SHARE_OF_GPU = 0.25
 """Largest share for photos of the memory that a GPU has free at the start."""
@@ -112,15 +110,8 @@ class PhotosOnDevice:
 
 
 def count_views(option: int | Literal["auto"]) -> int:
-    """Return the number of views of a step that an option asks for.
-
-    ``auto`` is one view up to two threads, where more bring nothing, then a view for every two
-    threads, and `MOST_VIEWS` at most: what more views save is less than what they cost in quality.
-    """
-    if option != "auto":
-        return option
-    threads = num_workers()
-    return 1 if threads <= 2 else min(threads // 2, MOST_VIEWS)
+    """Return the number of views of a step that an option asks for."""
+    return views_for_threads(num_workers()) if option == "auto" else option
 
 
 def views_of_step(most: int, index: int, progress: float) -> int:

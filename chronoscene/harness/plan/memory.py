@@ -17,7 +17,7 @@ from chronoscene.harness.plan.settings import RunSettings
 from chronoscene.images.disk_cache import DiskCache, files_of
 from chronoscene.images.store import ImageStore, decoded_bytes, evaluation_size
 from chronoscene.io.wording import counted
-from chronoscene.kernels.runtime import available_threads, machine_memory
+from chronoscene.kernels.runtime import available_threads, machine_memory, views_for_threads
 from chronoscene.methods import Method, MethodConfig, MethodSpec, import_object
 from chronoscene.scene import Scene
 
@@ -31,6 +31,9 @@ _LIBRARIES = 500 * 10**6  # Bytes of a training's process before it has a model
 _STEP = 250
 """Bytes per pixel of a photo that a training step takes for images and their gradients (3DGS with
 few Gaussians, measured)."""
+_FURTHER_VIEW = 140
+"""The same for each further view of the step that is rendered at the same time (ChronoGS, 2,000 x
+1,500 pixels, measured)."""
 _MODEL = 10**9
 """Bytes of a model in training. Values, gradients and two moments of half a million Gaussians with
 59 numbers each take 0.47 GB, and as much again is for what is made of them."""
@@ -58,8 +61,6 @@ class PhotoNeeds:
     """In memory, those that are being decoded included."""
     on_disk: int
     """0 if all fit into memory."""
-    training: int
-    """In memory besides the photos, without the model."""
     tests: int
     """Images of all test views."""
 
@@ -68,10 +69,17 @@ class PhotoNeeds:
         """Memory that they take within the limit."""
         return min(self.allowed, self.total + self.decoders * self.decoding)
 
-    @property
-    def of_run(self) -> int:
-        """Memory that a run takes, with a model of half a million Gaussians."""
-        return self.in_memory + self.training + _MODEL
+    def training(self, views: int) -> int:
+        """Return the memory besides the photos, without the model.
+
+        Args:
+            views: Number of views that are rendered at the same time.
+        """
+        return _LIBRARIES + (_STEP + (views - 1) * _FURTHER_VIEW) * self.pixels
+
+    def of_run(self, views: int) -> int:
+        """Return the memory of a run with a model of half a million Gaussians."""
+        return self.in_memory + self.training(views) + _MODEL
 
 
 def photo_needs(scene: Scene, settings: RunSettings) -> PhotoNeeds:
@@ -98,7 +106,6 @@ def photo_needs(scene: Scene, settings: RunSettings) -> PhotoNeeds:
         decoders=decoders,
         allowed=settings.photo_memory,
         on_disk=0 if fits else min(total, settings.photo_disk),
-        training=_LIBRARIES + _STEP * pixels,
         tests=sum(decoded_bytes(scene, frame, width) for frame in scene.select(split="test")),
     )
 
@@ -116,13 +123,23 @@ def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
     )
 
 
-def check_room(needs: PhotoNeeds, folder: Path, runs: int, *, here: bool = True) -> str:
+def views_at_a_time(config: MethodConfig, threads: int | None) -> int:
+    """Return how many views of a training step are rendered at the same time on CPUs."""
+    threads = threads or available_threads()
+    views = getattr(config, "views_per_step", 1)
+    return min(threads, views_for_threads(threads) if views == "auto" else views)
+
+
+def check_room(
+    needs: PhotoNeeds, folder: Path, runs: int, *, views: int = 1, here: bool = True
+) -> str:
     """Check that memory and disk have room for the photos of a scene.
 
     Args:
         needs: Of its runs.
         folder: Of all runs.
         runs: How many runs are to be done.
+        views: Views that they render at the same time, at most.
         here: True if this machine does them, so that its memory counts.
 
     Returns:
@@ -131,13 +148,14 @@ def check_room(needs: PhotoNeeds, folder: Path, runs: int, *, here: bool = True)
     Raises:
         ConfigError: If they have not; the message says which setting would do.
     """
-    _check_memory(needs, machine_memory()[1] if here else None)
+    training = needs.training(views)
+    _check_memory(needs, training, machine_memory()[1] if here else None)
     _check_disk(folder, needs, (1 + runs) * needs.tests)
     photos = f"{counted(needs.count, 'training photo')}, {_gb(needs.total)} when decoded"
     kept = f", {_gb(needs.on_disk)} on disk" if needs.on_disk else ""
     return (
         f"{needs.scene}: {photos}: {_gb(needs.in_memory)} in memory{kept}; a training takes "
-        f"{_gb(needs.training)} and its model besides"
+        f"{_gb(training)} and its model besides"
     )
 
 
@@ -163,7 +181,7 @@ def device_need(scene: Scene, needs: PhotoNeeds, spec: MethodSpec, config: Metho
     )
 
 
-def _check_memory(needs: PhotoNeeds, free: int | None) -> None:
+def _check_memory(needs: PhotoNeeds, training: int, free: int | None) -> None:
     least = needs.decoding + _AT_HAND * needs.largest
     if needs.allowed < least:
         width, height = needs.size
@@ -173,9 +191,9 @@ def _check_memory(needs: PhotoNeeds, free: int | None) -> None:
             found=_gb(needs.allowed),
             todo=f"use --photo-memory {math.ceil(least / 1e7) / 100}",
         )
-    wanted = needs.in_memory + needs.training
+    wanted = needs.in_memory + training
     if free is not None and free < wanted:
-        smaller = math.floor((free - needs.training) / 1e7) / 100
+        smaller = math.floor((free - training) / 1e7) / 100
         raise ConfigError(
             needs.scene,
             expected=f"{_gb(wanted)} of memory, {_gb(needs.in_memory)} of it for photos",

@@ -13,7 +13,7 @@ from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.checks import check_run
 from chronoscene.harness.plan.finished import continued, is_to_do
 from chronoscene.harness.plan.job import Job
-from chronoscene.harness.plan.memory import check_room, device_need
+from chronoscene.harness.plan.memory import check_room, device_need, views_at_a_time
 from chronoscene.harness.plan.parts import effective_strategy
 from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun, resolve_methods
 from chronoscene.harness.plan.scenes import BenchScene, read_scenes
@@ -43,17 +43,19 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     runs: dict[Path, ResolvedRun] = {}
     todo: dict[Path, ResolvedRun] = {}
     for scene in read_scenes(settings, log):
-        here = {run.job.folder: run for run in _runs_of_scene(settings, scene, methods)}
-        missing = {k: run for k, run in here.items() if is_to_do(run, settings.overwrite)}
-        if trained := sum(run.spec.runner is None for run in missing.values()):
-            log(check_room(scene.needs, shared.runs, trained, here=settings.ray is None))
+        asked = {run.job.folder: run for run in _runs_of_scene(settings, scene, methods)}
+        missing = {k: run for k, run in asked.items() if is_to_do(run, settings.overwrite)}
+        if trained := [run for run in missing.values() if run.spec.runner is None]:
+            views = max(views_at_a_time(run.config, shared.threads) for run in trained)
+            here = settings.ray is None
+            log(check_room(scene.needs, shared.runs, len(trained), views=views, here=here))
         if shared.device == "cuda":
             configs = {run.spec.name: (run.spec, run.config) for run in missing.values()}
             for needed in configs.values():
                 if line := device_need(scene.content, scene.needs, *needed):
                     log(line)
         freeze_ground_truth(shared.runs, scene.content, scene.hash, shared.max_width)
-        runs |= here
+        runs |= asked
         todo |= missing
     for notice in dict.fromkeys(chain(*(run.job.notices for run in runs.values()))):
         log(f"note: {notice}")
@@ -74,6 +76,7 @@ def _runs_of_scene(
         own = method.settings
         if own.budget_seconds is not None:
             notices.append(BUDGET_NOTICE)
+        views = views_at_a_time(method.config, own.threads)
         own = replace(own, keep_training=own.keep_training or settings.continue_to is not None)
         job = Job(
             origin=RunOrigin(
@@ -93,7 +96,7 @@ def _runs_of_scene(
             seed=seed,
             settings=own,
             notices=notices,
-            memory=settings.job_memory or scene.needs.of_run,
+            memory=settings.job_memory or scene.needs.of_run(views),
         )
         run = method.run(job)
         check_run(run)

@@ -9,7 +9,13 @@ from PIL import Image
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.plan import memory as planning
-from chronoscene.harness.plan.memory import check_room, device_need, open_store, photo_needs
+from chronoscene.harness.plan.memory import (
+    check_room,
+    device_need,
+    open_store,
+    photo_needs,
+    views_at_a_time,
+)
 from chronoscene.harness.plan.parts import make_parts
 from chronoscene.harness.plan.stop import StopRule
 from chronoscene.harness.train.checkpoints import Checkpoints
@@ -106,7 +112,27 @@ def test_memory_counts_where_the_run_will_be(make_scene, settings, free):
     with pytest.raises(ConfigError, match=r"expected 0\.50 GB of memory"):
         room(make_scene(), settings, runs=1)
     room(make_scene(), settings, runs=1, here=False)
-    assert 1.50e9 < photo_needs(make_scene(), settings).of_run < 1.51e9
+    assert 1.50e9 < photo_needs(make_scene(), settings).of_run(views=1) < 1.51e9
+
+
+def test_views_at_a_time_are_at_most_the_threads():
+    spec = load_spec("3dgs")
+
+    def views(option, threads):
+        config = build_config(spec, preset="fast", overrides={"views_per_step": option})
+        return views_at_a_time(config, threads)
+
+    assert [views(3, threads) for threads in (1, 2, 8)] == [1, 2, 3]
+    assert [views("auto", threads) for threads in (1, 2, 4, 64)] == [1, 1, 2, 4]
+    assert views_at_a_time(build_config(load_spec("nerf"), preset="fast"), 8) == 1
+
+
+def test_further_views_at_a_time_take_memory(make_scene, settings, free):
+    free(10**12, 10**12)
+    scene = big(make_scene())
+    settings.photo_memory, settings.max_width = 900_000_000, 6000
+    assert "a training takes 6.50 GB" in room(scene, settings, 1)
+    assert "a training takes 16.58 GB" in room(scene, settings, 1, views=4)
 
 
 def big(scene):
