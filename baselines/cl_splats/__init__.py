@@ -17,17 +17,6 @@ _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousand
     "sphere_share": 1.0,
 }
 
-_TUNED: dict[str, Any] = {  # docs/experiments/tuning.md
-    "exposure": "none",
-    "position_lr_initial": 1.503e-3,
-    "sh_dc_lr": 2.937e-3,
-    "opacity_lr": 0.1343,
-    "ssim_weight": 0.02598,
-    "cooldown": 0.3155,
-    "gradient_threshold": 5.751e-4,
-    "densify_interval": 188,
-}
-
 SPEC = MethodSpec(
     name="cl-splats",
     title="CL-Splats-style",
@@ -45,7 +34,7 @@ SPEC = MethodSpec(
         "paper-released": {"iterations": 100},
         "accurate": _SHORT | {"iterations": 8_000, "reset_interval": 7_500},
         "balanced": _SHORT | {"iterations": 3_000, "reset_interval": 8_000},
-        "fast": _SHORT | _TUNED | {"iterations": 1_000, "reset_interval": 30_000},
+        "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
     },
     strategy="sequential",
     per_period=("paper", "paper-released"),

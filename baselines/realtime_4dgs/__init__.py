@@ -16,19 +16,6 @@ _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousand
     "wave_dc_lr": 0.0025,
 }
 
-_TUNED: dict[str, Any] = {  # docs/experiments/tuning.md
-    "initial_time_scale": 0.4722,
-    "time_lr": 0.01796,
-    "wave_dc_lr": 8.669e-3,
-    "position_lr_initial": 1.503e-3,
-    "sh_dc_lr": 2.937e-3,
-    "opacity_lr": 0.1343,
-    "ssim_weight": 0.02598,
-    "cooldown": 0.3155,
-    "gradient_threshold": 5.751e-4,
-    "densify_interval": 188,
-}
-
 SPEC = MethodSpec(
     name="realtime4dgs",
     title="realtime4DGS",
@@ -46,7 +33,7 @@ SPEC = MethodSpec(
         "paper-scaled": {"length_unit": "training"},
         "accurate": _SHORT | {"iterations": 8_000, "reset_interval": 7_500},
         "balanced": _SHORT | {"iterations": 3_000, "reset_interval": 8_000},
-        "fast": _SHORT | _TUNED | {"iterations": 1_000, "reset_interval": 30_000},
+        "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
     },
     resumable=True,
     main_options=(*MAIN_OPTIONS, "sh_degree", "start_times", "initial_time_scale", "wave_cycle"),

@@ -44,29 +44,13 @@ SPEC = MethodSpec(
     },
 )
 
-_PERIOD_TUNED: dict[str, Any] = {  # docs/experiments/tuning.md
-    "appearance_dim": 34,
-    "offsets_per_anchor": 10,
-    "offset_lr": (0.04734, 4.734e-4),
-    "opacity_lr": (6.516e-3, 6.516e-5),
-    "feature_lr": (0.01593, 0.01593),
-    "color_lr": (0.03723, 2.327e-4),
-    "ssim_weight": 0.02598,
-    "cooldown": 0.3155,
-    "grad_threshold": 5.151e-4,
-    "density_interval": 94,
-}
-
 PERIOD_SPEC = replace(
     SPEC,
     name="scaffold-gs-period",
     title="Scaffold-GS, period appearance",
     period_input="continuous",
     method="baselines.scaffold_gs.method:ScaffoldGSPeriod",
-    presets={
-        name: {"appearance_dim": 32, **values} | (_PERIOD_TUNED if name == "fast" else {})
-        for name, values in _PRESETS.items()
-    },
+    presets={name: {"appearance_dim": 32, **values} for name, values in _PRESETS.items()},
     search={
         **SEARCH,
         "color_lr": Range(0.2, 5.0),
