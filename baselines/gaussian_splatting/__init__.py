@@ -19,19 +19,6 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
 }
 
-_TUNED_BALANCED: dict[str, Any] = {  # docs/experiments/tuning.md
-    "initial_opacity": 0.08114,
-    "position_lr_initial": 1.471e-3,
-    "scale_lr": 8.481e-3,
-    "rotation_lr": 2.105e-3,
-    "sh_dc_lr": 3.809e-4,
-    "opacity_lr": 0.01368,
-    "ssim_weight": 0.3452,
-    "cooldown": 0.2828,
-    "gradient_threshold": 3.116e-4,
-    "densify_interval": 186,
-}
-
 SPEC = MethodSpec(
     name="3dgs",
     title="3DGS",
@@ -42,7 +29,7 @@ SPEC = MethodSpec(
     devices=("cpu", "cuda"),
     method="baselines.gaussian_splatting.method:GaussianSplatting",
     config="chronoscene.gaussians.config:GaussianConfig",
-    presets=_PRESETS | {"balanced": _PRESETS["balanced"] | _TUNED_BALANCED},
+    presets=_PRESETS,
     resumable=True,
     main_options=(
         *MAIN_OPTIONS,
