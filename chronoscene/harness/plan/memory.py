@@ -32,8 +32,8 @@ _STEP = 250
 """Bytes per pixel of a photo that a training step takes for images and their gradients (3DGS with
 few Gaussians, measured)."""
 _FURTHER_VIEW = 140
-"""The same for each further view of the step that is rendered at the same time (ChronoGS, 2,000 x
-1,500 pixels, measured)."""
+"""Bytes per pixel of each further view of a step that is rendered at the same time (ChronoGS, 2,000
+x 1,500 pixels, measured)."""
 _MODEL = 10**9
 """Bytes of a model in training. Values, gradients and two moments of half a million Gaussians with
 59 numbers each take 0.47 GB, and as much again is for what is made of them."""
