@@ -147,7 +147,8 @@ deviation over ``n`` seeds, empty for one seed; ``low`` and ``high`` are the end
 interval over views. ``difference`` is that to the best mean of the same scene, quantity and
 column, with its 95 % interval by views and seeds (`differences`), which for single seeds is by
 views alone; seeds alone explain a difference of ``by_seeds``, empty if they are single. ``tied`` is
-True if the interval contains 0.
+True if the interval contains 0. Three or four views of a period decide that, but are too few for
+the ends of the interval to mean anything: these are empty.
 """
 
 
@@ -320,20 +321,23 @@ def compare_with(
     spread = seed_spread([first.sd, *rest.sd], ns)
     by_seeds = explained_by_seeds(spread, ns)
     margin = np.full(len(rest), math.nan)
+    freedom = _freedom(first.column, first.views)
     if known.any():
         family = np.append(True, known)
         margin[known] = margins(
             np.array([first["mean"], *rest["mean"]])[family],
             resampled[family],
-            _freedom(first.column, first.views),
+            freedom,
             SeedSpread(spread.variances[family], spread.freedom),
             ns[family],
             chosen=chosen,
         )
+    entries.loc[others, "tied"] = np.abs(difference) <= np.where(known, margin, by_seeds)
+    if freedom < 2:  # such a t-distribution has no variance: hundreds of dB would say nothing
+        margin[:] = math.nan
     entries.loc[others, [*DIFFERENCE]] = np.stack(
         [difference, difference - margin, difference + margin, by_seeds], axis=1
     )
-    entries.loc[others, "tied"] = np.abs(difference) <= np.where(known, margin, by_seeds)
 
 
 @lru_cache

@@ -124,6 +124,14 @@ def test_what_views_do_not_tell_apart_is_tied():
     assert found["b"].difference_low < 0 < found["b"].difference_high
 
 
+@pytest.mark.parametrize(("views", "shown"), [(4, False), (5, True)])
+def test_a_few_views_of_a_period_tie_without_an_interval(views, shown):
+    some, others = VIEWS[:, :views], (VIEWS - 1 + NOISE)[:, :views]
+    found = summarise([scored("a", psnr=some), scored("b", psnr=others)], ["psnr"])
+    (b,) = found[(found.method == "b") & (found.column == "period 0")].itertuples()
+    assert b.tied and np.isfinite(b.difference_low) == shown
+
+
 def test_what_seeds_do_not_tell_apart_is_tied():
     shifts = {"a": (0.0, 2.0), "b": (-1.0, 1.0), "c": (-29.0, -29.0)}
     runs = [scored(m, i, psnr=VIEWS + s[i]) for m, s in shifts.items() for i in range(2)]
