@@ -32,5 +32,5 @@ class ChronoGS(AnchorMethod):
     def merge_share(self) -> float:
         return self.config.merge_share
 
-    def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
-        return super().rates(camera_extent) | {"global_features": self.config.global_lr}
+    def rates(self, extent: float) -> dict[str, tuple[float, float]]:
+        return super().rates(extent) | {"global_features": self.config.global_lr}

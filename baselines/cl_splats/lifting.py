@@ -59,6 +59,8 @@ def begin_period(
     train: TrainingSet,
     render: Callable[[View, float], Prediction],
     config: CLSplatsConfig,
+    *,
+    extent: float,
     seed: int,
 ) -> None:
     """Find what has changed, and leave the model with what is to be optimised.
@@ -68,6 +70,7 @@ def begin_period(
         train: Its views are of the new period alone.
         render: Shows the model.
         config: Of both.
+        extent: That margins of spheres are multiples of.
         seed: Of the points that are drawn.
     """
     period = train.views[0].period
@@ -82,7 +85,7 @@ def begin_period(
         new = initialise(points, opacity=config.initial_opacity, scale=config.initial_scale)
     model.begin(period, rows, new)
     means = model.parameters["means"].detach().cpu().numpy()
-    spheres = enclose(means.astype(np.float64), config, train.camera_extent)
+    spheres = enclose(means.astype(np.float64), config, extent)
     model.spheres = torch.from_numpy(spheres.astype(np.float32)).to(splats.means.device)
 
 

@@ -58,7 +58,14 @@ class CLSplats(GaussianMethod):
     def extended_model(self, train: TrainingSet) -> PeriodModel:
         """The model with what has changed in a new period in training."""
         assert self.trainer is not None
-        begin_period(self.model, train, self.render, self.config, self.trainer.seed)
+        begin_period(
+            self.model,
+            train,
+            self.render,
+            self.config,
+            extent=self.extent(train),
+            seed=self.trainer.seed,
+        )
         return self.model
 
     def restore_model(self, tensors: dict[str, Tensor]) -> PeriodModel:

@@ -91,7 +91,7 @@ class Deformation4DGS(GaussianMethod):
 
     def learning_rates(self, due: Due) -> Mapping[str, float]:
         assert self.trainer is not None
-        config, field, extent = self.config, self.model.field, self.trainer.train.camera_extent
+        config, field, extent = self.config, self.model.field, self.trainer.extent
         progress = due.moment / config.schedule_length
         planes = log_linear(progress, config.plane_lr_initial, config.plane_lr_final) * extent
         layers = log_linear(progress, config.field_lr_initial, config.field_lr_final) * extent

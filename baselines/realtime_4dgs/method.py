@@ -59,7 +59,7 @@ class Realtime4DGS(GaussianMethod):
         return {
             **super().learning_rates(due),
             "right_quats": config.rotation_lr,
-            "time_means": config.time_lr * self.trainer.train.camera_extent,
+            "time_means": config.time_lr * self.trainer.extent,
             "log_time_scales": config.scale_lr,
             "waves_dc": config.wave_dc_lr,
             "waves_rest": config.sh_rest_lr,

@@ -29,8 +29,8 @@ class ScaffoldGSPeriod(AnchorMethod):
         dim = self.config.appearance_dim
         return replace(super().layout(train), global_dim=dim, global_heads=("color",))
 
-    def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
-        return super().rates(camera_extent) | {"global_features": self.config.appearance_lr}
+    def rates(self, extent: float) -> dict[str, tuple[float, float]]:
+        return super().rates(extent) | {"global_features": self.config.appearance_lr}
 
 
 class ScaffoldGS(ScaffoldGSPeriod):

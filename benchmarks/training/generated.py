@@ -55,6 +55,7 @@ def training_set(count: int, width: int, height: int) -> TrainingSet:
         point_periods=np.ones((count, PERIODS), bool),
         training_from_world=Sim3.identity(),
         camera_extent=1.1,
+        scene_extent=1.1,
         background=np.zeros(3, np.float32),
         load_image=lambda index: images[index],
     )

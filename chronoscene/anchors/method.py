@@ -52,11 +52,11 @@ class AnchorMethod(SplattingMethod):
         """Return the row of the varying features of each training view; here its period. [V]"""
         return np.array([view.period for view in train.views])
 
-    def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
+    def rates(self, extent: float) -> dict[str, tuple[float, float]]:
         """Return start and end of the learning rate of every tensor, by its name in the model."""
         config, (start, end) = self.config, self.config.offset_lr
         rates = {
-            "offsets": (start * camera_extent, end * camera_extent),
+            "offsets": (start * extent, end * extent),
             "features": config.feature_lr,
             "blocks": config.feature_lr,
             "log_scales": config.scaling_lr,
@@ -135,7 +135,7 @@ class AnchorMethod(SplattingMethod):
             train,
             voxel_size=self.meta["voxel_size"],
             seed=seed,
-            rates=self.rates(train.camera_extent),
+            rates=self.rates(self.extent(train)),
             feature_rows=self.feature_rows(train),
             merge_share=self.merge_share,
         )

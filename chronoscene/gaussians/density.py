@@ -81,7 +81,7 @@ def choose_growth(
     Args:
         gradient: `GradientStatistics.mean`. [N]
         max_scale: Largest of the three scales. [N]
-        extent: `TrainingSet.camera_extent`.
+        extent: `GaussianTrainer.extent`.
         config: Thresholds and limit of the number.
     """
     grow = gradient >= config.gradient_threshold
@@ -112,7 +112,7 @@ def densify(
     Args:
         parameters: Groups by name, see `model.SHAPES`; left as they are. [N, ...]
         gradient: Mean gradient. [N]
-        extent: `TrainingSet.camera_extent`.
+        extent: `GaussianTrainer.extent`.
         prune_large: Whether Gaussians may be too large.
         generator: Draws the centres of the parts.
         scatter: Makes them.

@@ -60,7 +60,7 @@ class GaussianMethod(SplattingMethod):
         assert self.trainer is not None
         config = self.config
         return {
-            "means": due.position_lr * self.trainer.train.camera_extent,
+            "means": due.position_lr * self.trainer.extent,
             "log_scales": config.scale_lr,
             "quats": config.rotation_lr,
             "logit_opacities": config.opacity_lr,
@@ -88,6 +88,7 @@ class GaussianMethod(SplattingMethod):
             self.config,
             self.model,
             train,
+            extent=self.extent(train),
             seed=seed,
             background=self.background,
             learning_rates=self.learning_rates,

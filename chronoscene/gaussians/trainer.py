@@ -115,6 +115,8 @@ class GaussianTrainer:
     """Trained in place."""
     train: TrainingSet
     _: KW_ONLY
+    extent: float
+    """Length that rates of positions and bounds of scales are multiples of."""
     seed: int
     """Seed of all random choices."""
     background: Tensor
@@ -283,7 +285,7 @@ class GaussianTrainer:
             result = densify(
                 self.model.parameters,
                 self.statistics.mean(),
-                extent=self.train.camera_extent,
+                extent=self.extent,
                 prune_large=prune_large,
                 config=self.config,
                 generator=np.random.default_rng((self.seed, _SPLIT_STREAM, index)),

@@ -21,7 +21,8 @@ class SplattingConfig:
     length_unit: str = "world"
     """Unit of the options that are lengths. ``world``: that of the scene, as in released code;
     ``training``: that of the training frame, in which the farthest camera is at distance 1, so
-    that the unit of the scene does not matter."""
+    that the unit of the scene does not matter. Where cameras stand close together before what they
+    see, half of its depth is 1."""
     near_plane: PositiveFloat = NEAR_PLANE
     """Nearest depth that is drawn, in `length_unit`. The default is common to all methods here; the
     official rasterizer of 3DGS has 0.2."""

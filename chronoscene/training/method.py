@@ -78,6 +78,8 @@ class SplattingMethod(ABC):
         self.background = torch.zeros(3)
         self.meta: dict[str, Any] = {}
         """Content of ``model.json``; subclasses add what `restore` needs."""
+        self.by_scene = False
+        """True if options are in units of the training frame, not as published."""
         self.trainer: Trainer | None = None
         """The trainer that `start` gave; None after `load`."""
         self._exposure: Tensor | None = None
@@ -107,6 +109,7 @@ class SplattingMethod(ABC):
         """Rebuild the model from `stored_tensors` and `meta`."""
 
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
+        self.by_scene = self.config.length_unit == "training"
         config = self.config.in_training_frame(train.training_from_world.scale)
         self.config = replace(config, views_per_step=count_views(config.views_per_step))
         background = np.array(train.background, np.float32)
@@ -120,6 +123,14 @@ class SplattingMethod(ABC):
             "background": background.tolist(),
         }
         self.trainer = self.start(train, seed=seed, device=device)
+
+    def extent(self, train: TrainingSet) -> float:
+        """Return the length that rates and bounds are multiples of, in training units.
+
+        Published values are multiples of the extent of the cameras. Where these stand close
+        together before what they see, most Gaussians are larger than a tenth of it, and pruned.
+        """
+        return train.scene_extent if self.by_scene else train.camera_extent
 
     def go_on(self, train: TrainingSet, trainer: Trainer) -> None:
         """Put another trainer in place of the one before: the last part of `extend`.

@@ -51,6 +51,7 @@ def train_set() -> TrainingSet:
         point_periods=np.ones((50, 1), bool),
         training_from_world=Sim3.identity(),
         camera_extent=1.1,
+        scene_extent=1.1,
         background=np.zeros(3, np.float32),
         load_image=lambda index: images[index],
     )

@@ -51,6 +51,7 @@ def noise_set() -> Callable[[int], TrainingSet]:
             point_periods=np.ones((60, num_periods), bool),
             training_from_world=Sim3(0.5, np.eye(3), np.array([1.0, 2.0, 3.0])),
             camera_extent=1.1,
+            scene_extent=1.1,
             background=np.array([0.1, 0.2, 0.3], np.float32),
             load_image=lambda index: images[index],
         )

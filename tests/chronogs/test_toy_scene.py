@@ -125,6 +125,7 @@ def training_set(periods: tuple[int, ...]) -> TrainingSet:
         point_periods=np.ones((len(points), len(periods)), bool),
         training_from_world=Sim3.identity(),
         camera_extent=1.1,
+        scene_extent=1.1,
         background=np.zeros(3, np.float32),
         load_image=lambda index: truth[index],
     )

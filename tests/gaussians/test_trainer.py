@@ -54,12 +54,13 @@ def test_a_run_that_ends_by_the_clock_follows_progress():
     assert due[-1].sh_degree == 3 and not due[-1].collect
 
 
-def test_positions_learn_in_units_of_the_camera_extent():
+@pytest.mark.parametrize(("unit", "kind"), [("world", "camera"), ("training", "scene")])
+def test_positions_learn_in_units_of_the_extent(unit, kind):
     """Adam's first step is as long as the learning rate, whatever the gradient."""
     scene, config = toy_scene(), GaussianConfig()
     for extent in (EXTENT, 3.0):
-        method = GaussianSplatting(SHORT)
-        method.setup(replace(scene, camera_extent=extent), seed=0, device="cpu")
+        method = GaussianSplatting(replace(SHORT, length_unit=unit))
+        method.setup(replace(scene, **{f"{kind}_extent": extent}), seed=0, device="cpu")
         before = method.model.parameters["means"].detach().clone()
         method.step(0, 0.0)
         moved = (method.model.parameters["means"].detach() - before).abs().max()

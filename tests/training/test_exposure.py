@@ -158,7 +158,7 @@ def wall_of(gains):
     return TrainingSet(
         views=tuple(views), num_periods=2, points=points.astype(np.float32),
         colors=np.full((300, 3), 100, np.uint8), point_periods=np.ones((300, 2), bool),
-        training_from_world=Sim3.identity(), camera_extent=1.1,
+        training_from_world=Sim3.identity(), camera_extent=1.1, scene_extent=1.1,
         background=np.zeros(3, np.float32), load_image=photos.__getitem__,
     )  # fmt: skip
 

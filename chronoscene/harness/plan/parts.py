@@ -14,11 +14,14 @@ from chronoscene.harness.files.strategies import STRATEGIES, period_part
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import MethodSpec, TrainingSet, TrainingView, View
 from chronoscene.scene import Frame, Scene
-from chronoscene.scene.cameras import PINHOLE_MODELS
+from chronoscene.scene.cameras import PINHOLE_MODELS, project_points
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3
 
 EXTENT_MARGIN = 1.1  # Factor of 3DGS between the farthest camera and the camera extent
+CLOSE = 0.5
+"""Cameras within this share of the depth of what they see leave the size of the scene to it."""
+MOST_VIEWS, MOST_POINTS = 100, 5_000  # That a median depth is taken from
 LEAST_SPREAD = 1e-6  # Of the points, over the distance of the farthest camera
 
 
@@ -158,24 +161,40 @@ def _no_points(place: object) -> SceneError:
 def training_frame(scene: Scene, periods: range | None = None) -> Sim3:
     """``training_from_world``: mean training camera at the origin, the farthest at distance 1.
 
-    Where all cameras stand at one place, the median distance of the points becomes 1 instead.
+    Where cameras stand close together before what they see, half of its depth becomes 1 instead.
 
     Args:
         scene: With training images.
         periods: Those whose cameras and points count; None for all.
     """
     periods = range(scene.num_periods) if periods is None else periods
-    centres = _centres(_training_frames(scene, periods))
+    frames = _training_frames(scene, periods)
+    centres = _centres(frames)
     centre = centres.mean(axis=0)
     radius = float(np.linalg.norm(centres - centre, axis=1).max())
     if radius <= 1e-9 * max(1.0, float(np.abs(centre).max())):
-        points = scene.points.xyz
-        if len(periods) < scene.num_periods:
-            points = points[_seen(scene, periods).any(axis=1)]
-        distances = np.linalg.norm(points - centre, axis=1)
-        radius = float(np.median(distances)) if distances.size else 1.0
-    scale = 1.0 / radius if radius > 0 else 1.0
+        radius = 0.0  # nothing but rounding
+    points = scene.points.xyz[_seen(scene, periods).any(axis=1)]
+    size = max(radius, CLOSE * _median_depth(frames, points))
+    scale = 1.0 / size if size > 0 else 1.0
     return Sim3(scale, np.eye(3), -scale * centre)
+
+
+def _median_depth(frames: Sequence[Frame], xyz: NDArray[np.float64]) -> float:
+    """Return the median over images of the median depth of the points in them; 0 without any.
+
+    Of many images and points, some that are evenly chosen.
+    """
+    frames = frames[:: len(frames) // MOST_VIEWS + 1]
+    xyz = xyz[:: len(xyz) // MOST_POINTS + 1]
+    depths = []
+    for frame in frames:
+        seen = xyz @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
+        pixels = project_points(frame.camera, seen)
+        size = (frame.camera.width, frame.camera.height)
+        inside = ((pixels >= 0) & (pixels <= size)).all(axis=1)
+        depths += [np.median(seen[inside, 2])] if inside.any() else []
+    return float(np.median(depths)) if depths else 0.0
 
 
 def _training_frames(scene: Scene, periods: range) -> tuple[Frame, ...]:
@@ -229,6 +248,8 @@ def _training_set(
             found=f"{len(points)} in one place",
             todo="triangulate some: chronoscene triangulate SCENE OUT",
         )
+    camera_extent = _camera_extent(frames, to_training)
+    depth = to_training.scale * _median_depth(frames, scene.points.xyz[kept])
     return TrainingSet(
         views=tuple(_training_view(f, store, to_training, hide_period) for f in frames),
         num_periods=1 if hide_period else known.stop,
@@ -236,7 +257,8 @@ def _training_set(
         colors=scene.points.rgb[kept],
         point_periods=np.ones((int(kept.sum()), 1), bool) if hide_period else seen[kept],
         training_from_world=to_training,
-        camera_extent=_camera_extent(frames, to_training),
+        camera_extent=camera_extent,
+        scene_extent=max(camera_extent, EXTENT_MARGIN * CLOSE * depth),
         background=np.zeros(3, np.float32),
         load_image=lambda i: store.load(frames[i]),
         load_mask=lambda i: store.load_mask(frames[i]),

@@ -74,6 +74,7 @@ def make_training_set(num_periods: int) -> TrainingSet:
         point_periods=np.ones((4 * BALLS, num_periods), bool),
         training_from_world=Sim3(0.25, np.eye(3), np.array([1.0, -2.0, 3.0])),
         camera_extent=1.1,
+        scene_extent=1.1,
         background=np.zeros(3, np.float32),
         load_image=load_image,
     )

@@ -41,6 +41,7 @@ def moving_scene(path: Path3D) -> TrainingSet:
         point_periods=np.ones((len(points), PERIODS), bool),
         training_from_world=Sim3(0.2, np.eye(3), np.zeros(3)),
         camera_extent=EXTENT,
+        scene_extent=EXTENT,
         background=np.zeros(3, np.float32),
         load_image=images.__getitem__,
     )

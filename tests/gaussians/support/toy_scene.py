@@ -76,6 +76,7 @@ def toy_scene(count=60, views=10, *, colors_per_period=1):
         point_periods=np.ones((count, 1), bool),
         training_from_world=Sim3.identity(),
         camera_extent=EXTENT,
+        scene_extent=EXTENT,
         background=np.zeros(3, np.float32),
         load_image=images.__getitem__,
     )

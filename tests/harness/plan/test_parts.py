@@ -152,7 +152,7 @@ def test_a_stage_knows_nothing_of_later_periods(make_scene, at_one_place):
     xyz[[4, 5, 6, 7]] += 100
     other = replace(scene.with_frames(later), points=replace(scene.points, xyz=xyz))
     one, two = (parts_of(s, "sequential")[0].train for s in (scene, other))
-    for field in ("points", "colors", "point_periods", "camera_extent"):
+    for field in ("points", "colors", "point_periods", "camera_extent", "scene_extent"):
         np.testing.assert_array_equal(getattr(one, field), getattr(two, field))
     frames = [train.training_from_world.to_matrix() for train in (one, two)]
     np.testing.assert_array_equal(*frames)
@@ -247,16 +247,28 @@ def test_a_period_with_one_training_camera_keeps_the_extent_of_the_scene(make_sc
     assert second.train.camera_extent == pytest.approx(1.1)
 
 
-def test_cameras_at_one_place_are_scaled_by_the_points(make_scene):
+@pytest.mark.parametrize("apart", [0.0, 0.02])
+def test_cameras_close_together_are_scaled_by_what_they_see(make_scene, apart):
     scene = make_scene()
     frames = []
-    for frame in scene.frames:
-        pose = frame.cam_from_world.copy()
-        pose[:3, 3] = -pose[:3, :3] @ [1.0, 2.0, 3.0]
+    for i, frame in enumerate(scene.frames):
+        pose = np.eye(4)
+        pose[:3, 3] = apart * i, 0.0, 10.0  # all look along z at the points, which are around 0
         frames.append(replace(frame, cam_from_world=pose))
-    (part,) = parts_of(scene.with_frames(frames), "joint")
-    scaled = part.train.training_from_world.apply(scene.points.xyz)
-    assert np.median(np.linalg.norm(scaled, axis=1)) == pytest.approx(1)
+    scene = scene.with_frames(frames)
+    (part,) = parts_of(scene, "joint")
+    train, depth = part.train, np.median(world_points(part)[:, 2]) + 10
+    assert train.training_from_world.scale == pytest.approx(1 / (0.5 * depth))
+    assert train.scene_extent == pytest.approx(1.1)
+    if apart:
+        centres = np.array([camera_centre(f.cam_from_world) for f in scene.select(split="train")])
+        radius = np.linalg.norm(centres - centres.mean(0), axis=1).max()
+        assert train.camera_extent == pytest.approx(1.1 * radius / (0.5 * depth))
+
+
+def test_the_extent_of_cameras_around_a_scene_is_that_of_the_scene(make_scene):
+    for part in parts_of(make_scene(), "separate"):
+        assert part.train.scene_extent == part.train.camera_extent
 
 
 def test_distorted_cameras_are_refused(make_scene):
