@@ -21,8 +21,9 @@ from chronoscene.formats import DetectedFormat
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.colmap_layout import keep_images, write_renamed
 from chronoscene.images.store import ImageSource, Progress
+from chronoscene.io.documents import read_text
 from chronoscene.io.wording import shown
-from chronoscene.scene import Period, Points, Scene
+from chronoscene.scene import Period, Points, Scene, splits
 from chronoscene.scene.splits import NameIndex
 
 Box = tuple[float, float, float, float, float, float]
@@ -66,17 +67,18 @@ class Edited:
     """Points that lost observations and have fewer than `MIN_VIEWS` left."""
 
 
-def read_for_edit(detected: DetectedFormat, edits: Edits) -> tuple[Scene, Edits, int]:
+def read_for_edit(detected: DetectedFormat, edits: Edits) -> tuple[Scene, Edits, int, int]:
     """Read a scene, without the images to drop if it cannot be read because of them.
 
     Returns:
-        The scene, what is left to do, and the number of images that were left out already.
+        The scene, what is left to do, and the numbers of images and of points that were left out
+        already.
 
     Raises:
         SceneError: If it cannot be read without them either.
     """
     try:
-        return detected.read(), edits, 0
+        return detected.read(), edits, 0, 0
     except SceneError:
         if detected.name != our_format.NAME or not edits.drop:
             raise
@@ -84,8 +86,22 @@ def read_for_edit(detected: DetectedFormat, edits: Edits) -> tuple[Scene, Edits,
         names = [image.name for image in model.images]
         dropped = find_images(names, edits.drop, "--drop")
         left = keep_images(model, set(names) - dropped)
-        scene = our_format.read(detected.path, model=left)
-        return scene, replace(edits, drop=()), len(dropped)
+        scene = our_format.read(detected.path, model=left, empty_periods=True)
+        scene = _with_split_of_all(scene, names)
+        unseen = _lost_views(model.points, left.points)
+        scene = replace(scene, points=scene.points.select(~unseen))
+        return scene, replace(edits, drop=()), len(dropped), int(np.count_nonzero(unseen))
+
+
+def _with_split_of_all(scene: Scene, names: Sequence[str]) -> Scene:
+    """Give images the split that they have by the default rule over all names of the model."""
+    if scene.split_rule != splits.DEFAULT_RULE:
+        return scene
+    entries, _ = splits.parse_split_text(read_text(scene.root / our_format.SPLIT))
+    tests = splits.default_tests(splits.assign_periods(names, entries)[0])
+    return scene.with_frames(
+        [replace(f, split=splits.split_of(f.name, tests)) for f in scene.frames]
+    )
 
 
 def edit(
@@ -267,9 +283,14 @@ def _points_of(
     """Keep points inside that the kept frames see; also count those that lost their views."""
     rank = (np.cumsum(frames) - 1).astype(np.int32)
     left = points.select_observations(frames[points.track_frame], rank)
-    before, after = np.diff(points.track_start), np.diff(left.track_start)
-    unseen = inside & (after < before) & (after < MIN_VIEWS)
+    unseen = inside & _lost_views(points, left)
     return left.select(inside & ~unseen), int(np.count_nonzero(unseen))
+
+
+def _lost_views(before: Points, after: Points) -> NDArray[np.bool_]:
+    """Return True for points that lost observations and have fewer than `MIN_VIEWS` left. [P]"""
+    old, new = np.diff(before.track_start), np.diff(after.track_start)
+    return np.asarray((new < old) & (new < MIN_VIEWS))
 
 
 def _renames(scene: Scene, rename: Mapping[str, str]) -> tuple[dict[int, str], dict[str, str]]:

@@ -191,5 +191,58 @@ def test_images_because_of_which_a_scene_cannot_be_read(folder):
     with pytest.raises(SceneError, match="a period for every registered image"):
         read_for_edit(detect(folder), Edits(drop=("old/02.png",)))
     edits = Edits(drop=("old/02.png", "new/05.png"), rename={"0": "x"})
-    scene, left, unread = read_for_edit(detect(folder), edits)
+    scene, left, unread, unseen = read_for_edit(detect(folder), edits)
     assert (len(scene.frames), unread, left) == (16, 2, Edits(rename={"0": "x"}))
+    assert (len(scene.points), unseen) == (30, 0)
+
+
+def test_what_is_left_is_the_same_whether_the_scene_could_be_read_or_not(make_scene_folder):
+    folder = make_scene_folder(
+        {f"{p}/{i:02d}.png": j for j, p in enumerate("ab") for i in range(9)}
+    )
+    model = folder / "sparse/0"
+    raw = read_raw_model(model)
+    for file in model.glob("*.bin"):
+        file.unlink()
+    start, points = raw.points.track_start, raw.points
+    kept = np.concatenate([np.arange(start[i], start[i] + 2 + i % 2) for i in range(len(points))])
+    points = replace(
+        points,
+        track_start=np.concatenate([[0], np.cumsum(2 + np.arange(len(points)) % 2)]),
+        track_image=points.track_image[kept],
+        track_keypoint=points.track_keypoint[kept],
+    )
+    write_raw_model(model, raw.cameras, raw.images, points)
+    edits = Edits(drop=("a/00.png",))
+    readable = apply(read_scene(folder), edits)
+    translations = raw.images.translations.copy()
+    translations[raw.images.names.index("a/00.png")] = np.nan
+    images = replace(raw.images, translations=translations)
+    write_raw_model(model, raw.cameras, images, points)
+    scene, left, unread, unseen = read_for_edit(detect(folder), edits)
+    done = apply(scene, left)
+    assert (unread, unseen) == (readable.images_dropped, readable.points_unseen) and unseen > 0
+    assert observations(done.scene) == observations(readable.scene)
+    assert done.scene.points.ids.tolist() == readable.scene.points.ids.tolist()
+    splits = [[(f.name, f.split) for f in d.scene.frames] for d in (done, readable)]
+    assert splits[0] == splits[1]
+
+
+def test_a_period_goes_with_the_only_image_that_cannot_be_read(make_scene_folder):
+    folder = make_scene_folder({"a/0.png": 0, "a/1.png": 0, "b/0.png": 1, "c/0.png": 2})
+    raw = read_raw_model(folder / "sparse/0")
+    translations = raw.images.translations.copy()
+    translations[raw.images.names.index("b/0.png")] = np.nan
+    for file in (folder / "sparse/0").glob("*.bin"):
+        file.unlink()
+    images = replace(raw.images, translations=translations)
+    write_raw_model(folder / "sparse/0", raw.cameras, images, raw.points)
+    scene, left, *_ = read_for_edit(detect(folder), Edits(drop=("b/0.png",)))
+    new = apply(scene, left).scene
+    assert [(f.name, f.period) for f in new.frames] == [
+        ("a/0.png", 0),
+        ("a/1.png", 0),
+        ("c/0.png", 1),
+    ]
+    with pytest.raises(ConfigError, match="expected an image that stays"):
+        apply(*read_for_edit(detect(folder), Edits(drop=("*",)))[:2])

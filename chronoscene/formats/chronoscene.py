@@ -44,12 +44,13 @@ def matches(path: Path) -> bool:
     return (path / SPLIT).is_file()
 
 
-def read(path: Path, *, model: Model | None = None) -> Scene:
+def read(path: Path, *, model: Model | None = None, empty_periods: bool = False) -> Scene:
     """Read a scene; stops at the first problem.
 
     Args:
         path: Folder of the scene.
         model: Its COLMAP model, where that was read before.
+        empty_periods: Accept periods without an image in the model.
     """
     path = Path(path)
     entries, problems = splits.parse_split_text(read_text(path / SPLIT))
@@ -59,7 +60,7 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
         check_image(path / MODEL, image)
     names = [image.name for image in model.images]
     periods, problems = splits.assign_periods(names, entries)
-    raise_first(path / SPLIT, problems)
+    raise_first(path / SPLIT, (p for p in problems if p.kind != "empty" or not empty_periods))
     tests, rule = read_tests(path, names, periods)
     return Scene(
         name=path.resolve().name,
@@ -67,7 +68,7 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
         images_root=path / "images",
         frames=make_frames(model, periods, tests),
         points=model.points,
-        periods=read_periods(path, 1 + max(periods.values())),
+        periods=read_periods(path, 1 + max(entry.period for entry in entries)),
         split_rule=rule,
         format=NAME,
         world=read_world(path),

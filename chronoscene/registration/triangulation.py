@@ -18,7 +18,7 @@ from chronoscene.images.exif import read_exif
 from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.images.store import ImageSource, place_image, place_images
 from chronoscene.io.processes import Report
-from chronoscene.io.staging import staged_folder
+from chronoscene.io.staging import sha256_of, staged_folder
 from chronoscene.registration.context import EXHAUSTIVE_LIMIT, Context, Options
 from chronoscene.registration.features.camera_groups import scene_groups
 from chronoscene.registration.features.correspondences import extract_features
@@ -82,6 +82,7 @@ def triangulate(
     with work_folder(work) as lock:
         context = Context(work, Stages(work), Options(threads=threads), report, lock)
         names = _place(scene, context)
+        _depend_on_files(scene, context)
         frames = tuple(replace(f, name=names[f.name]) for f in scene.frames)
         extract_features(scene_groups(replace(scene, frames=frames)), context)
         result = _run(replace(scene, frames=frames), context)
@@ -115,6 +116,16 @@ def _place(scene: Scene, context: Context) -> dict[str, str]:
         if mask := scene.masks.get(frame.name):
             place_image(mask, context.work / mask_place(name), "symlink")
     return names
+
+
+def _depend_on_files(scene: Scene, context: Context) -> None:
+    """Make all stages depend on the content of photos and masks, which may have been corrected."""
+    masks = scene.masks
+    files = {
+        f.name: [sha256_of(path) for path in (scene.image_path(f), masks.get(f.name)) if path]
+        for f in scene.frames
+    }
+    context.stages.run("files", files, lambda: ({}, []))
 
 
 def _run(scene: Scene, context: Context) -> Mapping[str, Any]:

@@ -48,7 +48,8 @@ class SplitSettings:
     """``stratified``: draw one image of each run instead of the first. ``blocked``: chooses the
     test blocks; None means 0."""
     blocks: int | None = None
-    """``blocked``: number of blocks; None for two test blocks, or more if periods need them."""
+    """``blocked``: number of blocks; None for two test blocks, or more if periods need them; for
+    two training blocks where more than half of the images are held out."""
     periods: tuple[int, ...] = ()
     """``periods``: ids of the periods held out."""
 
@@ -175,6 +176,7 @@ def hold_out_validation(scene: Scene) -> Scene:
 
 def _check(settings: SplitSettings) -> None:
     for option, given, strategies in (
+        ("--fraction", settings.fraction != FRACTION, ("stratified", "blocked", "date")),
         ("--offset", settings.offset != 0, ("stratified",)),
         ("--seed", settings.seed is not None, ("stratified", "blocked")),
         ("--blocks", settings.blocks is not None, ("blocked",)),
@@ -249,7 +251,7 @@ def whole_periods(scene: Scene, settings: SplitSettings, times: Times) -> set[st
 def blocked(scene: Scene, settings: SplitSettings, times: Times) -> set[str]:
     """Choose the images of whole blocks of camera positions; by default, of two blocks."""
     centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
-    count = settings.blocks or max(2, round(2 / settings.fraction))
+    count = settings.blocks or max(2, round(2 / min(settings.fraction, 1 - settings.fraction)))
     if count > len(centres):
         raise ConfigError(
             "--blocks",

@@ -6,7 +6,7 @@ import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -101,12 +101,16 @@ def other_format(path: Path, options: ReadOptions = DETECT) -> DetectedFormat | 
 
     A ``split.txt`` in a wrong place shows that it is meant to be. Of several formats the first is
     returned: reading the scene reports that there are several.
+
+    Raises:
+        ConfigError: If periods are to be chosen, and it is in the ChronoScene format.
     """
+    if options.format == our_format.NAME or (options.format is None and our_format.matches(path)):
+        _ = DetectedFormat(path, our_format.NAME, period_by=options.period_by).options  # raises
+        return None
     if options.format is not None:
-        if options.format == our_format.NAME:
-            return None
         return formats.detect(path, format=options.format, period_by=options.period_by)
-    if our_format.matches(path) or any((path / place).is_file() for place in SPLIT_ELSEWHERE):
+    if any((path / place).is_file() for place in SPLIT_ELSEWHERE):
         return None
     try:
         return formats.match_format(path, period_by=options.period_by)
@@ -128,7 +132,18 @@ def _read_project(scene: RawScene, detected: DetectedFormat) -> Origin:
         assigned: Assigned = module.assign(images, scene.names, **detected.options)
     except SceneError as error:
         return Origin(detected, is_project=True, error=error)
-    return Origin(detected, is_project=True, assigned=assigned if scene.names else None)
+    if not scene.names:
+        return Origin(detected, is_project=True)
+    return Origin(detected, is_project=True, assigned=_with_labels(assigned, detected))
+
+
+def _with_labels(assigned: Assigned, detected: DetectedFormat) -> Assigned:
+    """Take labels and dates of the periods from their file, unless a rule defines the periods."""
+    periods, table = assigned.grouped
+    if detected.period_by is None and (detected.path / our_format.PERIODS).exists():
+        with suppress(SceneError):  # which reading the scene reports
+            table = our_format.read_periods(detected.path, len(table))
+    return replace(assigned, grouped=(periods, table))
 
 
 @contextmanager

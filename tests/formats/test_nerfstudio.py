@@ -107,6 +107,12 @@ def test_periods_from_times(nerfstudio_folder):
     assert [f.period for f in scene.frames] == [0, 1, 0, 1]
 
 
+def test_labels_tell_close_times_apart(nerfstudio_folder):
+    folder = nerfstudio_folder(NAMES, periods=False)
+    edit_frames(folder, lambda i, frame: frame.update(time=20160501.0 + i % 2))
+    assert [p.label for p in read_scene(folder).periods] == ["20160501", "20160502"]
+
+
 def test_a_time_for_every_frame_needs_a_grouping(nerfstudio_folder):
     folder = nerfstudio_folder(NAMES, periods=False)
     edit_frames(folder, lambda i, frame: frame.update(time=[3.0, 2.0, 1.0, 0.0][i]))

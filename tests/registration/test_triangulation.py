@@ -107,6 +107,24 @@ def test_poses_of_other_photos_are_refused(bare: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_photos_that_were_corrected_are_looked_at_again(bare: Path, tmp_path: Path) -> None:
+    folder, out = tmp_path / "scene", tmp_path / "out"
+    scene = read_scene(bare)
+    some = [f.name for f in scene.frames if f.period == 0][:4]
+    edit(scene, folder, Edits(keep=tuple(some)))
+    photos = [folder / "images" / name for name in some]
+    right = [photo.read_bytes() for photo in photos]
+    agreeing = []
+    for contents in (right[1:] + right[:1], right):
+        for photo, data in zip(photos, contents, strict=True):
+            photo.write_bytes(data)
+        # What only two of so few photos have in common is no point.
+        with pytest.raises(RegistrationError, match=r"found \d+: \d+ of \d+ matches") as caught:
+            triangulate(read_scene(folder), out, threads=1)
+        agreeing.append(int(str(caught.value).split(": ")[2].split()[0]))
+    assert agreeing[1] > 3 * agreeing[0]
+
+
 def test_files_of_another_size_and_single_images_are_refused(bare: Path, tmp_path: Path) -> None:
     scene = read_scene(bare)
     with pytest.raises(RegistrationError, match="expected two images or more, found 1"):

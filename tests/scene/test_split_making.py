@@ -85,6 +85,8 @@ def test_stratified_offset_and_seed():
         ({"strategy": "blocked", "offset": 1}, "--offset"),
         ({"strategy": "date", "seed": 1}, "--seed"),
         ({"strategy": "stratified", "periods": (1,)}, "--period"),
+        ({"strategy": "periods", "periods": (1,), "fraction": 0.5}, "--fraction"),
+        ({"strategy": "none", "fraction": 0.5}, "--fraction"),
         ({"strategy": "periods"}, "--period"),
         ({"strategy": "periods", "periods": (0, 2)}, "--period"),
         ({"strategy": "periods", "periods": (0, 1)}, "split"),
@@ -119,6 +121,12 @@ def test_blocks_are_the_same_in_all_periods(seed):
     for period in range(3):
         assert split.scene.select(split="test", period=period)
         assert split.scene.select(split="train", period=period)
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.125, 0.3, 0.5, 0.6, 0.8, 0.9])
+def test_blocks_hold_out_the_share_that_was_asked_for(fraction):
+    scene = make_split(flights(40, 2), SplitSettings("blocked", fraction=fraction)).scene
+    assert len(scene.select(split="test")) / 80 == pytest.approx(fraction, abs=0.05)
 
 
 def test_blocked_test_views_are_farther_from_training_views():

@@ -13,9 +13,10 @@ from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, describe_period, show_note
 from chronoscene.convert import convert
 from chronoscene.errors import ConfigError
-from chronoscene.formats import writable_formats
-from chronoscene.geodesy import from_crs, read_projected
+from chronoscene.formats import read_scene, writable_formats
+from chronoscene.geodesy import Georeference, from_crs, read_projected
 from chronoscene.registration.report.coordinates import placed_scene, write_coordinates
+from chronoscene.scene import WorldFrame
 from chronoscene.scene.splits import split_hash
 
 
@@ -64,16 +65,33 @@ def command(
         )
     scene = done.scene
     if system is not None:
-        frame = from_crs(scene.world.crs)
-        if frame is None:
-            raise ConfigError(
-                "--crs", expected="a georeferenced scene", found=f"{source}, which is not: {out} "
-                "was written without coordinates", todo="register it with GPS or ground control",
-            )  # fmt: skip
-        write_coordinates(out, placed_scene(scene), frame, system)
+        frame = _local_frame(scene.world, out)
+        # The images of OUT may have other names.
+        write_coordinates(out, placed_scene(read_scene(out, format=target)), frame, system)
     lines = [f"{out}: {target} from {scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")
     emit("\n".join(lines) + "\n", None)
     for warning in done.warnings:
         show_note(warning)
+
+
+def _local_frame(world: WorldFrame, out: Path) -> Georeference:
+    """Return the local frame of a registration that world coordinates are in.
+
+    Raises:
+        ConfigError: If they are in another system, or in none.
+    """
+    frame = from_crs(world.crs)
+    if frame is not None and not any(world.offset):
+        return frame
+    found, todo = "one without a reference system", "register it with GPS or ground control"
+    if world.crs is not None:
+        found = f"{world.crs} with the offset {', '.join(f'{x:.12g}' for x in world.offset)}"
+        todo = "add the offset to the coordinates of the scene: the sums are in that system"
+    raise ConfigError(
+        "--crs",
+        expected="a georeferenced scene in the local frame of register, without an offset",
+        found=f"{found}: {out} was written without coordinates",
+        todo=todo,
+    )

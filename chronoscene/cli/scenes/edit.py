@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -75,9 +76,12 @@ def command(
     check_place("OUT", out)
     with progress_bar(f"read {source}") as bar:
         detected = detect(source, format=dataset_format, period_by=period_by)
-        scene, left, unread = read_for_edit(detected, edits)
+        scene, left, images, points = read_for_edit(detected, edits)
         done = edit(scene, out, left, image_source=LINKS[link], progress=partial(bar, "images"))
-    emit(report(done, unread), None)
+    done = replace(  # with what was left out when the scene was read
+        done, images_dropped=done.images_dropped + images, points_unseen=done.points_unseen + points
+    )
+    emit(report(done), None)
     for note in (*detected.notes, *remarks_on(scene), *obstacles(done.scene), *_poor(done.scene)):
         show_note(note)
 
@@ -102,17 +106,12 @@ def parse_box(text: str) -> Box:
     return x0, y0, z0, x1, y1, z1
 
 
-def report(done: Edited, unread: int) -> str:
-    """Sizes and losses, for people.
-
-    Args:
-        done: The result.
-        unread: Images that were left out when the scene was read.
-    """
+def report(done: Edited) -> str:
+    """Sizes and losses, for people."""
     new = done.scene
     lines = [f"{new.root}: {describe(new)}"]
     lines += [f"  {describe_period(new, period.id)}" for period in new.periods]
-    lines.append(f"{counted(unread + done.images_dropped, 'image')} left out")
+    lines.append(f"{counted(done.images_dropped, 'image')} left out")
     if done.images_outside:
         lines[-1] += f", {done.images_outside} of them because they see nothing in the box"
     points = [

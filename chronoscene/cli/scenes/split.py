@@ -12,7 +12,8 @@ import click
 from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import A_FILE, check_place, emit, writing_to
 from chronoscene.cli.progress import announce, progress_bar
-from chronoscene.cli.scenes.reading import describe_period, read_and_note
+from chronoscene.cli.scenes.reading import describe_period, read_and_note, show_note
+from chronoscene.convert import remarks_on
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.exif import capture_times
@@ -98,6 +99,8 @@ def command(
     if out is not None:
         _write(split, out, "OUT")
     emit(report(split), None)
+    for note in remarks_on(scene) if scene_out is not None else ():
+        show_note(note)
 
 
 def _fraction(fraction: float | None, every: int | None) -> float:

@@ -23,7 +23,7 @@ from chronoscene.cli.output import (
     writing_to,
 )
 from chronoscene.cli.progress import tracked
-from chronoscene.errors import ChronoSceneError
+from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import detect, find_scenes, nearby_scenes, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
@@ -131,9 +131,12 @@ def command(
     were read, 1 if some were, 2 if none was or the command is used wrongly.
     """
     request = StatsRequest(**options)  # type: ignore[arg-type]
+    if request.cameras and request.figures is None:
+        raise click.UsageError("--cameras needs --figures")
     reading = {"format": request.dataset_format, "period_by": request.period_by}
     folders = folders or (nearby_scenes(**reading),)
-    paths = [p for f in folders for p in in_paper_order(_scenes(f, request))]
+    alone = len(folders) == 1
+    paths = [p for f in folders for p in in_paper_order(_scenes(f, request, alone=alone))]
     _check_places(request, out, paths)
     items = list(zip(paths, _file_names(paths), strict=True))
     work = map_parallel(partial(examine, request), items, lost=_lost)
@@ -201,9 +204,18 @@ def examine(
     return measure_scene(scene, count=request.count)
 
 
-def _scenes(folder: Path, request: StatsRequest) -> list[Path]:
-    """Find the scenes of a folder, and folders that look like one, so that none is overlooked."""
-    scenes = find_scenes(folder, format=request.dataset_format, period_by=request.period_by)
+def _scenes(folder: Path, request: StatsRequest, *, alone: bool) -> list[Path]:
+    """Find the scenes of a folder, and folders that look like one, so that none is overlooked.
+
+    A folder without a scene is an error if it is alone; of several, it is returned itself, and the
+    attempt to read it fails.
+    """
+    try:
+        scenes = find_scenes(folder, format=request.dataset_format, period_by=request.period_by)
+    except SceneError:
+        if alone:
+            raise
+        return [folder]
     found = [scene.path for scene in scenes]
     if found == [folder]:
         return found

@@ -10,7 +10,8 @@ import click
 from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
-from chronoscene.cli.scenes.reading import LINKS, describe, read_and_note
+from chronoscene.cli.scenes.reading import LINKS, describe, read_and_note, show_note
+from chronoscene.convert import remarks_on
 from chronoscene.images.undistortion import CameraChange
 from chronoscene.io.staging import check_outside
 from chronoscene.scene.splits import split_hash
@@ -52,8 +53,9 @@ def command(
     """
     check_outside(out, [source])
     with progress_bar(f"read {source}") as bar:
+        scene = read_and_note(source, dataset_format, period_by)
         done = undistort(
-            read_and_note(source, dataset_format, period_by),
+            scene,
             out,
             center=center,
             threads=threads,
@@ -61,6 +63,8 @@ def command(
             progress=partial(bar, "images"),
         )
     emit(report(done), None)
+    for note in remarks_on(scene):
+        show_note(note)
 
 
 def report(done: Undistortion) -> str:

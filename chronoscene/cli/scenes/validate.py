@@ -9,14 +9,14 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import PATH, reading_options
-from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit, say
+from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit, say, terminal_width
 from chronoscene.cli.progress import announce, tracked
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import keep_freed_memory
 from chronoscene.validation.folder.scene_folder import Track, no_progress
-from chronoscene.validation.repair.fix import fix_scene
+from chronoscene.validation.repair.fix import check_fixable, fix_scene
 from chronoscene.validation.report.html import write_html
 from chronoscene.validation.report.json import write_json, write_sarif
 from chronoscene.validation.report.rule_list import describe_rule
@@ -25,7 +25,7 @@ from chronoscene.validation.rule import SceneReport, is_valid
 from chronoscene.validation.rules import choose_rules
 from chronoscene.validation.run import ReadOptions, find_folders, lost_report, validate_scene
 
-WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
+WRITERS = {"json": write_json, "sarif": write_sarif, "html": write_html}
 
 NOT_VALID = 1  # Exit status when there are errors
 
@@ -43,7 +43,7 @@ def _explain(context: click.Context, option: click.Parameter, value: str | None)
 @click.option(
     "--format",
     "output_format",
-    type=click.Choice(sorted(WRITERS)),
+    type=click.Choice(sorted([*WRITERS, "text"])),
     default="text",
     help="Output format.",
 )
@@ -120,7 +120,11 @@ def command(
     else:
         done = map_parallel(check, folders, lost=lost_report)
         reports = list(tracked(done, "check scenes", total=len(folders)))
-    emit(WRITERS[output_format](reports, strict=strict), out)
+    if output_format == "text":
+        text = write_text(reports, strict=strict, width=terminal_width(out))
+    else:
+        text = WRITERS[output_format](reports, strict=strict)
+    emit(text, out)
     for option, file, write in (("--sarif", sarif, write_sarif), ("--html", html, write_html)):
         if file is not None:
             emit(write(reports, strict=strict), file, option=option)
@@ -146,6 +150,8 @@ def _check(
 def _fix(folder: Path, scenes: Sequence[Path], out: Path, options: ReadOptions) -> list[Path]:
     """Write corrected copies of the scenes; list the corrections on standard error."""
     copies = []
+    for scene in scenes:
+        check_fixable(scene, options)  # before any copy is written
     for scene in scenes:
         copy = out if scene == folder else out / scene.name
         announce(f"correct {scene}")

@@ -77,14 +77,18 @@ def group_dates(dates: Mapping[str, date], by: str) -> Grouped:
 
 
 def group_times(times: Mapping[str, float], by: str) -> Grouped:
-    """Group images by times of an unknown unit; labels are times.
+    """Group images by times of an unknown unit; labels are times, all different.
 
     Raises:
         ConfigError: As `group_dates`.
     """
 
+    distinct = set(times.values())
+    digits = next(d for d in (6, 12, 17) if len({f"{t:.{d}g}" for t in distinct}) == len(distinct))
+
     def describe(first: float, last: float) -> tuple[str, str | None]:
-        return (f"{first:g}" if first == last else f"{first:g} to {last:g}"), None
+        a, b = (f"{time:.{digits}g}" for time in (first, last))
+        return (a if first == last else f"{a} to {b}"), None
 
     return _group_numbers(times, by, describe, rules=("gap:X", "count:N"))
 

@@ -24,6 +24,7 @@ from chronoscene.validation.folder.names import spelling
 from chronoscene.validation.folder.scene_folder import RawScene, TextFile, read_text_file
 from chronoscene.validation.repair import contents
 from chronoscene.validation.repair.contents import Repair
+from chronoscene.validation.rules.cs1_cameras import rig_pose_differs
 from chronoscene.validation.rules.cs2_image_files import images_of_other_shape
 from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE, TEST_ELSEWHERE
 from chronoscene.validation.run import DETECT, ReadOptions, is_project, other_format, quiet_numbers
@@ -45,6 +46,17 @@ def fix_scene(root: Path, out: Path, options: ReadOptions = DETECT) -> list[Repa
         SceneError: If ``out`` is in use or cannot be written.
     """
     check_outside(out, [root], option="--fix")
+    check_fixable(root, options)
+    with staged_folder(out) as staged, quiet_numbers():
+        return _Fix(RawScene(root), staged).run()
+
+
+def check_fixable(root: Path, options: ReadOptions = DETECT) -> None:
+    """Refuse a scene in another format than ours and that of a COLMAP project.
+
+    Raises:
+        ConfigError: If it is one.
+    """
     detected = other_format(root, options)
     if detected is not None and not is_project(detected):
         raise ConfigError(
@@ -53,8 +65,6 @@ def fix_scene(root: Path, out: Path, options: ReadOptions = DETECT) -> list[Repa
             found=f"one in {detected.name}",
             todo="convert it with chronoscene convert, then correct the result",
         )
-    with staged_folder(out) as staged, quiet_numbers():
-        return _Fix(RawScene(root), staged).run()
 
 
 class _Fix:
@@ -84,6 +94,8 @@ class _Fix:
             return
         if model.cameras is None or model.images is None or model.points is None:
             return
+        if not _is_binary(model) and any(rig_pose_differs(self._scene, model, model.images)):
+            return  # without rigs and frames, the images would have other poses
         images, points, repairs = contents.repair_model(model.images, model.points)
         repairs += _form_repairs(model, place)
         if not repairs:
@@ -105,12 +117,11 @@ class _Fix:
 
     def _move_rigs(self, model: RawModel, below: str) -> None:
         """Rigs and frames move with a binary model; those of a text model would not be read."""
-        binary = model.files.get("cameras", "").endswith(".bin")
         for stem in ("rigs", "frames"):
             for form in FORMS:
                 self._written.add(f"{below}{stem}{form}")
             source = model.folder / f"{stem}.bin"
-            if binary and source.is_file():
+            if _is_binary(model) and source.is_file():
                 _link(source, self._out / MODEL / f"{stem}.bin")
 
     def _split(self, names: list[str] | None) -> None:
@@ -202,7 +213,7 @@ class _Fix:
 
     def _inside(self, name: str) -> bool:
         images = (self._scene.root / "images").resolve()
-        return (images / name).resolve().is_relative_to(images)
+        return _leads_into(images / name, images)
 
     def _copy_rest(self) -> None:
         """Copy everything else unchanged, except links that lead out of the scene.
@@ -214,7 +225,7 @@ class _Fix:
         linked, parts = 0, self._parts()
         for place in parts:
             source, target = self._scene.root / place, self._out / place
-            if source.resolve().is_relative_to(top) or not place.startswith(("images/", MASKS)):
+            if _leads_into(source, top) or not place.startswith(("images/", MASKS)):
                 _link(source, target)
             else:
                 target.parent.mkdir(parents=True, exist_ok=True)
@@ -226,7 +237,7 @@ class _Fix:
         for path, place in _files(top):
             if place in self._written:
                 continue
-            if path.resolve().is_relative_to(top):
+            if _leads_into(path, top):
                 if path.is_file():
                     _link(path, self._out / place)
             elif not any(part == place or part.startswith(f"{place}/") for part in parts):
@@ -262,6 +273,11 @@ class _Fix:
         return True
 
 
+def _is_binary(model: RawModel) -> bool:
+    """Return True if rigs and frames are read in binary form."""
+    return model.files.get("cameras", "").endswith(".bin")
+
+
 def _form_repairs(model: RawModel, place: str) -> list[Repair]:
     """Corrections of the place and the form of the files."""
     repairs = []
@@ -283,6 +299,11 @@ def _files(top: Path) -> Iterator[tuple[Path, str]]:
         for name in sorted(files) + [n for n in folders if os.path.islink(os.path.join(folder, n))]:
             path = Path(folder) / name
             yield path, path.relative_to(top).as_posix()
+
+
+def _leads_into(path: Path, top: Path) -> bool:
+    """Return True if a path is in a folder when links are followed, also for links in a circle."""
+    return Path(os.path.realpath(path)).is_relative_to(top)
 
 
 def _link(source: Path, target: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from itertools import groupby
@@ -22,19 +20,21 @@ MAX_LINES = 5  # Different lines shown of one rule
 MIN_WIDTH = 40  # Columns below which lines are not wrapped further
 
 
-def write_text(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
-    """Readable report of some scenes."""
+def write_text(
+    reports: Sequence[SceneReport], *, strict: bool = False, width: int | None = None
+) -> str:
+    """Readable report of some scenes.
+
+    Args:
+        reports: Of the scenes.
+        strict: Warnings make a scene invalid, too.
+        width: Columns of the terminal that it goes to; None for lines of any length.
+    """
     blocks = [_scene(report) for report in reports]
     if len(reports) > 1:
         bad = sum(not is_valid([r], strict=strict) for r in reports)
         blocks.append([f"{counted(len(reports), 'scene')}, {bad} not valid: {_total(reports)}"])
-    width = _width()
     return "\n\n".join("\n".join(_fit(line, width) for line in block) for block in blocks) + "\n"
-
-
-def _width() -> int | None:
-    """Columns of the terminal; None without one: other programs get unwrapped lines."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def _fit(line: str, width: int | None) -> str:

@@ -75,8 +75,10 @@ def exif_period_order(scene: RawScene) -> Iterator[Hit]:
 
 
 def _dates_place(scene: RawScene) -> str:
-    """Return the file that has the dates of the periods."""
-    return scene.period_place if scene.is_project else PERIODS
+    """Return the file that has the dates of the periods, or the folder whose names have them."""
+    chosen = scene.origin is not None and scene.origin.detected.period_by is not None
+    in_names = scene.is_project and (chosen or not (scene.root / PERIODS).exists())
+    return scene.period_place if in_names else PERIODS
 
 
 @rule.warning(

@@ -78,6 +78,36 @@ def test_coordinates_in_a_reference_system(make_scene_folder, tmp_path):
     assert (tmp_path / "out/points.ply").is_file()
 
 
+def test_coordinates_are_of_the_images_that_were_written(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    world = {"crs": Georeference(51.0, 11.0, 200.0, "as stated").crs}
+    (folder / "sparse/world.json").write_text(json.dumps(world))
+    assert run(folder, tmp_path / "out", "--to", "wat", "--crs", "EPSG:32632").exit_code == 0
+    rows = list(csv.DictReader((tmp_path / "out/cameras.csv").open()))
+    new = read_scene(tmp_path / "out", format="wat")
+    assert [r["image"] for r in rows] == [f.name for f in new.frames]
+    assert all((tmp_path / "out/images" / r["image"]).is_file() for r in rows)
+    assert rows[0]["image"] != read_scene(folder).frames[0].name
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        {"crs": "EPSG:32632", "offset": [640000, 5650000, 200]},
+        {"crs": Georeference(51.0, 11.0, 200.0, "as stated").crs, "offset": [10, 0, 0]},
+    ],
+)
+def test_coordinates_are_not_written_without_the_offset(make_scene_folder, tmp_path, world):
+    folder = make_scene_folder()
+    (folder / "sparse/world.json").write_text(json.dumps(world))
+    with pytest.raises(
+        ConfigError, match="the local frame of register, without an offset"
+    ) as error:
+        run(folder, tmp_path / "out", "--crs", "EPSG:32632")
+    assert f"{world['crs']} with the offset" in str(error.value)
+    assert not (tmp_path / "out/cameras.csv").exists()
+
+
 def test_help_lists_formats_and_groupings():
     text = " ".join(run("--help").stdout.split())
     for word in ("cl-splats", "neusc: year, month, day, gap:DAYS, count:N", "--link", "table:FILE"):

@@ -117,3 +117,10 @@ def test_the_order_in_files_does_not_matter(make_scene_folder, tmp_path, strateg
     assert run(scene, tmp_path / "two.txt", *strategy).exit_code == 0
     assert (tmp_path / "one.txt").read_text() == (tmp_path / "two.txt").read_text()
     assert (tmp_path / "one.json").read_text() == (tmp_path / "two.json").read_text()
+
+
+def test_scene_out_names_what_is_left_out(scene, tmp_path):
+    (scene / "gt").mkdir()
+    note = "note: not part of the format, and not converted: gt/\n"
+    assert note in run(scene, "--scene-out", tmp_path / "new").stderr
+    assert note not in run(scene, tmp_path / "test.txt").stderr

@@ -188,6 +188,23 @@ def test_a_scene_that_cannot_be_read_does_not_cost_the_others(
     assert len(done.stderr.splitlines()) == 4
 
 
+def test_a_folder_that_is_no_scene_does_not_cost_the_others(
+    make_scene_folder, tmp_path, one_process
+):
+    folder, other = make_scene_folder(), tmp_path / "absent"
+    result = run(other, folder, "--format", "json")
+    assert result.exit_code == 1
+    data = json.loads(result.stdout)
+    assert [s["name"] for s in data["scenes"]] == ["scene"]
+    assert [u["path"] for u in data["unreadable"]] == [str(other)]
+    assert "expected a scene folder, found nothing" in result.stderr
+
+
+def test_cameras_are_drawn_in_figures_only(make_scene_folder):
+    result = run(make_scene_folder(), "--cameras")
+    assert result.exit_code == 2 and "--cameras needs --figures" in result.stderr
+
+
 def test_a_scene_that_is_not_known_as_one_is_not_left_out_in_silence(
     make_scene_folder, tmp_path, one_process
 ):

@@ -6,6 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import cli, main
+from chronoscene.convert import convert
 from chronoscene.formats import read_scene
 
 
@@ -46,6 +47,13 @@ def test_says_what_was_dropped(make_scene_folder, tmp_path):
     result = run(folder, tmp_path / "out", "--center")
     assert "PINHOLE 20 x 20" in result.stdout
     assert "observations outside of the new images, and " in result.stdout
+
+
+def test_names_what_is_left_out(make_scene_folder, tmp_path):
+    convert(make_scene_folder(), tmp_path / "other", target="nerfstudio")
+    (tmp_path / "other/images/a/0002.png").unlink()
+    result = run(tmp_path / "other", tmp_path / "out")
+    assert "note: 1 frames are left out, as their image is missing" in result.stderr
 
 
 def test_says_that_nothing_had_to_be_done(make_scene_folder, tmp_path):

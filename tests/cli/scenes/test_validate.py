@@ -110,6 +110,22 @@ def test_out_has_no_colours(broken, tmp_path):
     assert "\x1b" not in (tmp_path / "report.txt").read_text()
 
 
+def test_lines_of_a_file_are_not_broken(broken, tmp_path, monkeypatch):
+    expected = run(broken)[1]
+    monkeypatch.setattr(
+        "chronoscene.cli.scenes.validate.terminal_width", lambda out: None if out else 50
+    )
+    assert run(broken)[1] != expected
+    run(broken, "--out", tmp_path / "report.txt")
+    assert (tmp_path / "report.txt").read_text() == expected
+
+
+@pytest.mark.parametrize("options", [[], ["--dataset-format", "chronoscene"]])
+def test_periods_of_our_format_cannot_be_chosen(good, options):
+    with pytest.raises(ConfigError, match="no such option for chronoscene"):
+        run(good, "--period-by", "year", *options)
+
+
 def test_ignore_makes_a_scene_valid(broken):
     status, text = run(broken, "--ignore", "CS201")
     assert status == 0
@@ -176,6 +192,15 @@ def test_fix_of_several_scenes(make_scene_folder, tmp_path, one_process):
     status, text = run(tmp_path / "all", "--fix", tmp_path / "fixed")
     assert status == 0 and "2 scenes, 0 not valid" in text
     assert sorted(p.name for p in (tmp_path / "fixed").iterdir()) == ["one", "two"]
+
+
+def test_no_copy_is_written_if_one_of_several_scenes_cannot_be(make_scene_folder, tmp_path):
+    make_scene_folder(PERIODS, name="all/one", tests=["a3", "b3"])
+    (tmp_path / "all/two").mkdir()
+    (tmp_path / "all/two/transforms.json").write_text('{"frames": []}')
+    with pytest.raises(ConfigError, match="found one in nerfstudio"):
+        run(tmp_path / "all", "--fix", tmp_path / "fixed")
+    assert not (tmp_path / "fixed").exists()
 
 
 def test_fix_into_the_scene_is_refused(good, monkeypatch, capsys):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.colmap.model import read_raw_model
+from chronoscene.colmap.model import read_raw_model, read_reconstruction
 from chronoscene.errors import ChronoSceneError, DiskFullError
 from chronoscene.formats import read_scene
 from chronoscene.io.processes import stoppable
@@ -433,3 +433,27 @@ def test_observations_of_two_images_with_one_id_stay(scene, fix):
     scene.edit_fields(IMAGES, 2, {0: "1"})
     fixed, after, _ = fix()
     assert fixed == set() and {"CS106", "CS504"} <= after
+
+
+def test_text_whose_rigs_say_other_poses_stays(scene, tmp_path):
+    scene.to_binary(classic=False)
+    folder = scene.path("sparse/0")
+    read_reconstruction(folder).write_text(str(folder))
+    for file in folder.glob("*.bin"):
+        file.unlink()
+    row = next(i for i, line in enumerate(scene.lines(IMAGES)) if line.endswith("a003.png"))
+    scene.edit_fields(IMAGES, row, {5: "40.0"})
+    assert "CS143" in codes(scene.validate())
+    fix_scene(scene.root, tmp_path / "fixed")
+    assert "CS143" in codes(validate_scene(tmp_path / "fixed"))
+    old, new = (
+        np.stack([f.cam_from_world for f in read_scene(root).frames])
+        for root in (scene.root, tmp_path / "fixed")
+    )
+    np.testing.assert_array_equal(old, new)
+
+
+def test_links_in_a_circle_are_left_out(scene, tmp_path):
+    scene.path("sparse/periods.json").symlink_to("periods.json")
+    fix_scene(scene.root, tmp_path / "fixed")
+    assert not os.path.lexists(tmp_path / "fixed/sparse/periods.json")

@@ -144,12 +144,11 @@ def test_words():
     assert printable("a\tb\u202e") == "a\\tb\\u202e"
 
 
-def test_lines_are_broken_for_a_terminal_only(scene, monkeypatch):
+def test_lines_are_broken_for_a_terminal_only(scene):
     scene.path("images/a000.png").unlink()
     report = scene.validate()
     whole = write_text([report])
     assert max(map(len, whole.splitlines())) > 100
-    monkeypatch.setattr("chronoscene.validation.report.text._width", lambda: 80)
-    broken = write_text([report])
+    broken = write_text([report], width=80)
     assert max(len(click.unstyle(line)) for line in broken.splitlines()) <= 80
     assert broken.split() == whole.split()

@@ -1,3 +1,4 @@
+import json
 import shutil
 
 import pytest
@@ -325,3 +326,15 @@ def test_the_model_of_a_project_is_looked_for_once(project, monkeypatch):
     report = project.validate()
     assert not report.count("error") and "CS006" in codes(report)
     assert looked == [project.root]
+
+
+def test_labels_and_dates_of_a_project_are_those_of_their_file(project):
+    periods = [{"id": 0, "label": "before", "date": "2023"}, {"id": 1, "date": "2016-09"}]
+    project.write("sparse/periods.json", json.dumps(periods))
+    report = project.validate()
+    assert [p.label for p in report.summary.periods] == ["before", None]
+    (said,) = [f for f in report.findings if f.code == "CS227"]
+    assert (said.place, said.found) == ("sparse/periods.json (period 1)", "2016-09")
+    project.write("sparse/periods.json", "[]")
+    (said,) = [f for f in project.validate().findings if f.severity == "error"]
+    assert (said.code, said.place) == ("CS009", "sparse/periods.json")
