@@ -26,7 +26,7 @@ MAX_TRIES = 60
 def make_camera(settings: SynthSettings) -> Camera:
     """The pinhole camera that all frames share."""
     w, h = settings.width, settings.height
-    focal = (0.82 if settings.kind == "aerial" else 0.68) * w
+    focal = (0.68 if settings.kind == "street" else 0.82) * w
     if not settings.off_centre:
         return Camera(1, "PINHOLE", w, h, (focal, focal, w / 2, h / 2))
     # Rounded to quarters of a pixel: exact in binary, and clearly not the image centre.
@@ -39,7 +39,7 @@ def plan_frames(
 ) -> tuple[Frame, ...]:
     """All frames, period by period."""
     camera = make_camera(settings)
-    route = _flight if settings.kind == "aerial" else _walk
+    route = ROUTES[settings.kind]
     frames: list[Frame] = []
     for period in range(settings.periods):
         count = max(4, round(settings.views * UNEQUAL[period % len(UNEQUAL)]))
@@ -146,6 +146,23 @@ def _walk(world: World, count: int, rng: np.random.Generator) -> list[tuple[Arra
     return planned
 
 
+def _before(world: World, count: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+    """South of the core, within a few metres, all looking at its middle."""
+    half = float(np.abs(world.core).max())
+    middle = world.core.mean(axis=0)
+    planned = []
+    for i in range(count):
+        along = (2 * (i + rng.uniform(0, 1)) / count - 1) * 0.07 * half
+        place = middle + np.array([along, -0.95 * half + rng.normal(0, 1)])
+        eye = np.array([*place, 0.55 * half + rng.normal(0, 1.2)])
+        planned.append((eye, np.array([*(middle + rng.normal(0, 0.1 * half, 2)), 4.0])))
+    return planned
+
+
+ROUTES = {"aerial": _flight, "street": _walk, "facing": _before}
+"""Ways that cameras go, by kind."""
+
+
 def _free_pose(
     eye: Array,
     target: Array,
@@ -158,10 +175,10 @@ def _free_pose(
 
     All periods count because test views are rendered at every one of them.
     """
-    apart = 6.0 if kind == "aerial" else 2.0
+    apart = 2.0 if kind == "street" else 6.0
     for attempt in range(MAX_TRIES):
         shift = np.zeros(3)
-        if attempt and kind == "aerial":
+        if attempt and kind != "street":
             shift = np.array([*rng.normal(0, 1.0 + 0.1 * attempt, 2), 0.9 * attempt])
         elif attempt:
             shift = np.array([*rng.normal(0, 0.25 + 0.05 * attempt, 2), 0.02 * attempt])

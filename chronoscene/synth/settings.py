@@ -8,7 +8,7 @@ from typing import Any
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 
-KINDS = ("aerial", "street")
+KINDS = ("aerial", "street", "facing")
 
 
 def _within(low: float, high: float, default: float) -> Any:
@@ -21,7 +21,8 @@ class SynthSettings:
     """All inputs of a synthetic scene. Lengths are metres."""
 
     kind: str = "aerial"
-    """``aerial``: oblique orbits and grids. ``street``: walks along the roads."""
+    """``aerial``: oblique orbits and grids. ``street``: walks along the roads.
+    ``facing``: a few metres in front of the city, looking one way."""
     periods: int = _within(1, 50, 3)
     """Number of dates of capture, T."""
     width: int = _within(16, 8192, 320)

@@ -158,7 +158,13 @@ def test_progress_counts_to_the_end(tmp_path: Path) -> None:
         {"kind": "street", "off_centre": True, "noise": 0.5},
         *(
             pytest.param(change, marks=pytest.mark.slow)
-            for change in ({"off_centre": True}, {"rebuilt": 1.0}, {"noise": 0.5}, {"periods": 1})
+            for change in (
+                {"kind": "facing"},
+                {"off_centre": True},
+                {"rebuilt": 1.0},
+                {"noise": 0.5},
+                {"periods": 1},
+            )
         ),
     ],
     ids=str,
