@@ -43,6 +43,11 @@ def plain(text: str) -> str:
     return printable(text).replace("$", r"\$")
 
 
+def plain_lines(text: str) -> str:
+    """Escape as `plain` does, but keep the ends of lines."""
+    return "\n".join(map(plain, text.split("\n")))
+
+
 def save(figure: Any, path: Path, **options: Any) -> None:
     """Write a figure in the format that the suffix names; equal figures give equal bytes.
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from importlib.util import find_spec
+from keyword import iskeyword
 from pathlib import Path
 
 import click
@@ -59,6 +61,14 @@ def new(name: str, out: Path | None) -> None:
             expected="small letters and digits, in words joined by hyphens",
             found=repr(name),
             todo="choose a name like my-method",
+        )
+    module = name.replace("-", "_")
+    if iskeyword(module) or find_spec(module) is not None:
+        raise ConfigError(
+            "NAME",
+            expected="one that no word or module of Python has",
+            found=f"{module!r}, whose package would stand in its place",
+            todo="choose another name",
         )
     out = out or Path(name)
     with staged_folder(out) as staging:

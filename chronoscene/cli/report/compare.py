@@ -19,8 +19,9 @@ from chronoscene.cli.output import (
     writing_to,
 )
 from chronoscene.cli.progress import progress_bar
-from chronoscene.errors import ConfigError
+from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.harness.files.ground_truth import truth_of
+from chronoscene.harness.files.records import Failure, RunRecord
 from chronoscene.harness.report.comparison_page import comparison_page
 from chronoscene.harness.report.figures.between import between_csv, between_table, draw_between
 from chronoscene.harness.report.figures.comparison import by_scene, chosen_views, draw_figures
@@ -86,12 +87,12 @@ def command(
     """
     check_file("--out", out)
     check_file("--html", html)
+    _refuse_options("without" if periods is None else "with")
     if periods is not None:
-        _refuse_options()
         compare_between(runs, periods, style, out, scene, plugin)
         return
     metric = metric_info(metric).name
-    records, failures = read_runs([runs])
+    records, failures = _finished(runs)
     scores = view_scores(records, metric)
     worst = list(worst_views(scores, records, metric))
     if style == "csv":
@@ -110,13 +111,26 @@ def command(
         report_written(html)
 
 
-def _refuse_options() -> None:
-    """Refuse options that have no effect with --periods."""
+def _finished(runs: Path) -> tuple[list[RunRecord], list[Failure]]:
+    """Read the runs of a folder, of which one at least is finished, and the failures."""
+    records, failures = read_runs([runs])
+    if not records:
+        raise CheckpointError(
+            runs,
+            expected="a finished run",
+            found=f"runs that failed: {failures[0].reason}",
+            todo="correct that, and run bench again",
+        )
+    return records, failures
+
+
+def _refuse_options(way: str) -> None:
+    """Refuse options that have no effect ``with`` or ``without`` --periods."""
     context = click.get_current_context()
-    for name in ("views", "metric", "html"):
+    for name in ("views", "metric", "html") if way == "with" else ("scene", "plugin"):
         if context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
             raise ConfigError(
-                f"--{name}", expected="none with --periods", found="one", todo="leave one out"
+                f"--{name}", expected=f"none {way} --periods", found="one", todo="leave one out"
             )
 
 
@@ -129,10 +143,17 @@ def compare_between(
     plugin: tuple[str, ...],
 ) -> None:
     """Render and score the methods of all scenes between two periods; draw a figure of each."""
-    records, _ = read_runs([runs])
+    records, _ = _finished(runs)
     found = []
     with progress_bar() as bar:
-        for name, chosen in by_scene(records).items():
+        for name, drawn in by_scene(records).items():
+            # Other programs, whose threads are not known, do not render here.
+            chosen = [record for record in drawn if record.threads is not None]
+            for record in drawn:
+                if record.threads is None:
+                    say(f"{record.label}: left out, as another program made its images")
+            if not chosen:
+                continue
             opened = [open_run(record.folder, plugin=plugin) for record in chosen]
             dates = parse_dates(opened[0], periods)
             views = chosen_views(truth_of(chosen[0].folder), 1)

@@ -157,7 +157,7 @@ def table(
         parse_metrics(metrics),
         published=published,
         periods=periods,
-        renames=dict(_pair(text) for text in renames),
+        renames=_renames(renames, style),
         columns=_columns(columns, style),
         width=width,
     )
@@ -165,11 +165,21 @@ def table(
 
 
 def _columns(text: str | None, style: str) -> tuple[str, ...]:
+    _refuse_with_data("--columns", text, style)
+    return () if text is None else split_list("--columns", text)
+
+
+def _renames(texts: tuple[str, ...], style: str) -> dict[str, str]:
+    _refuse_with_data("--rename", texts[0] if texts else None, style)
+    return dict(_pair(text) for text in texts)
+
+
+def _refuse_with_data(option: str, text: str | None, style: str) -> None:
+    """Refuse an option on what people read: CSV and JSON have fixed columns, and no titles."""
     if text is not None and style in ("csv", "json"):
         raise ConfigError(
-            "--columns", expected=f"none with {style}", found=repr(text), todo="leave it out"
+            option, expected=f"none with {style}", found=repr(text), todo="leave it out"
         )
-    return () if text is None else split_list("--columns", text)
 
 
 def _pair(text: str) -> tuple[str, str]:

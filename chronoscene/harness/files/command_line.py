@@ -9,6 +9,8 @@ from typing import Any
 
 OPTIONS = ("iterations", "budget", "separate_iterations", "max_width", "protocol")
 """Names in a variant that are options of ``bench``, not of the method."""
+FLAGS = ("validation", "fit_half")
+"""Names of options without a value, likewise."""
 
 
 def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None) -> str:
@@ -33,6 +35,8 @@ def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None)
         elif name == "compressed":
             loss = ["--plain"] if value == "plain" else ["--max-loss", value.removesuffix("dB")]
             compress = ["chronoscene", "compress", "RUN", *loss]
+        elif name in FLAGS:
+            words.append(f"--{name.replace('_', '-')}")
         elif name in OPTIONS:
             words += [f"--{name.replace('_', '-')}", value]
         else:

@@ -347,9 +347,14 @@ def _is_final(folder: Path) -> bool:
     return folder.name.removeprefix("seed").isdigit()
 
 
-def write_summary(runs: Path) -> list[RunRecord]:
-    """Write ``results.json`` and ``rows.csv`` of all finished runs below a folder."""
-    folders = run_folders(runs)
+def write_summary(runs: Path, folders: Sequence[Path] | None = None) -> list[RunRecord]:
+    """Write ``results.json`` and ``rows.csv`` of all finished runs below a folder.
+
+    Args:
+        runs: The folder.
+        folders: Runs that are in the files; None for all.
+    """
+    folders = run_folders(runs) if folders is None else folders
     records = [read_run(folder) for folder in folders]
     documents = [json.loads(record.model_dump_json()) for record in records]
     write_text_atomic(runs / RESULTS_FILE, json.dumps(documents, indent=1, allow_nan=False) + "\n")

@@ -130,8 +130,19 @@ class ResolvedRun:
         return cls(job, spec, config, stop, document)
 
     def stops(self, parts: Sequence[Part]) -> tuple[StopRule, ...]:
-        """Return the end of the training of each model, or of each stage."""
+        """Return the end of the training of each model, or of each stage.
+
+        Raises:
+            ConfigError: If there are fewer iterations than models, so that one would stay as it is.
+        """
         if self.job.settings.separate_iterations != "each":
+            if self.stop.iterations is not None and self.stop.iterations < len(parts):
+                raise ConfigError(
+                    f"{self.spec.name} --iterations",
+                    expected=f"at least one for each of {len(parts)} models or stages",
+                    found=f"{self.stop.iterations} in all",
+                    todo="use more iterations, or --separate-iterations each",
+                )
             return self.stop.split(len(parts))
         periods = [{view.period for view in part.train.views} for part in parts]
         return tuple(self.stop.times(len(own)) for own in periods)

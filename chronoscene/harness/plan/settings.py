@@ -111,12 +111,13 @@ class BenchSettings:
             run = self.run
             fixed = self.scenes, self.strategies, run.max_width, run.validation
             check_protocol(run.protocol, *fixed)
-        overrides = self.run.overrides
+        own = any(key.rpartition(".")[2] == "iterations" for key in self.run.overrides)
         given = {
             "--continue-to": self.continue_to,
             "--iterations": self.run.iterations,
-            "--set iterations": any(key.rpartition(".")[2] == "iterations" for key in overrides),
-            "--budget": self.continue_to and self.run.budget_seconds,
+            "--set iterations": own,
+            # Only --iterations ends a training beside it.
+            "--budget": (self.continue_to or own) and self.run.budget_seconds,
         }
         options = [name for name, value in given.items() if value]
         if len(options) > 1:

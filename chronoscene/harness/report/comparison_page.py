@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from chronoscene import __version__
 from chronoscene.harness.files.ground_truth import truth_of
-from chronoscene.harness.files.predictions import ImageEntry, load_image, load_mask, read_manifest
+from chronoscene.harness.files.predictions import ImageEntry, load_image, read_manifest
 from chronoscene.harness.files.records import Failure, RunRecord
 from chronoscene.harness.report.figures.comparison import (
     ShownRun,
@@ -23,6 +23,7 @@ from chronoscene.harness.report.figures.comparison import (
 from chronoscene.harness.report.quality_curves import draw_curves
 from chronoscene.harness.report.summary import summarise
 from chronoscene.harness.report.tables import footnotes, period_name, readable_tables
+from chronoscene.harness.score.regions import scored_mask
 from chronoscene.io.pages import data_uri, render_page
 from chronoscene.io.tables import Table
 
@@ -117,7 +118,7 @@ def _shown_views(found: dict[str, list[RunRecord]], max_bytes: int) -> dict[str,
 def _shown_view(
     truth: Path, entry: ImageEntry, methods: Sequence[ShownRun], labels: dict[str, str]
 ) -> ShownView:
-    photo, mask = load_image(truth, entry), load_mask(truth, entry)
+    photo, mask = load_image(truth, entry), scored_mask(truth, entry, methods[0].fitted)
     predictions = []
     for run in methods:
         image = load_image(run.folder, run.entries[entry.view])

@@ -458,7 +458,13 @@ def footnotes(
     absent = []
     for run in records:
         costs = [(COST_TITLES.get(cost), why) for cost, why in run.absent.items()]
-        for missing, reason in (*run.skipped.items(), *costs):
+        there = {*run.skipped, *run.aggregates.get("macro", {})}
+        unasked = [
+            (name, f"no value: chronoscene score RUNS --metric {name} computes it where it can be")
+            for name in wanted
+            if name not in there
+        ]
+        for missing, reason in (*run.skipped.items(), *costs, *unasked):
             if missing in wanted if wanted else missing:
                 absent.append((reason, missing))
     notes += [f"absent: {names}: {reason}" for reason, names in _grouped(absent)]

@@ -39,19 +39,28 @@ def left_half(height: int, width: int) -> Mask:
     return np.broadcast_to(np.arange(width) < width // 2, (height, width))
 
 
+def scored_mask(folder: Path, entry: ImageEntry, fitted: str = "") -> Mask | None:
+    """Return the pixels of a view that are scored; None for all of them. [H, W]
+
+    The mask of the photo ignores the others, or an appearance was fitted to them
+    (`RunRecord.fitted`).
+    """
+    mask = load_mask(folder, entry)
+    if not fitted:
+        return mask
+    right = ~left_half(entry.height, entry.width)
+    return right if mask is None else mask & right
+
+
 def regions_of(
     folder: Path, entry: ImageEntry, fitted: str = ""
 ) -> Iterator[tuple[str, Mask | None]]:
     """Yield names and masks of the regions of a view; None for all pixels. [H, W]
 
     A pixel is *changed* if it differs from at least one other period, and *invariant* if it is the
-    same in all of them. Pixels that the mask of the photo ignores are in no region, nor are those
-    that an appearance was fitted to (`RunRecord.fitted`).
+    same in all of them. Pixels that are not scored (`scored_mask`) are in no region.
     """
-    mask, changed = load_mask(folder, entry), load_changed(folder, entry)
-    if fitted:
-        right = ~left_half(entry.height, entry.width)
-        mask = right if mask is None else mask & right
+    mask, changed = scored_mask(folder, entry, fitted), load_changed(folder, entry)
     yield ALL, mask
     if changed is not None:
         counted = True if mask is None else mask

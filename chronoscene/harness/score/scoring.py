@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.errors import CheckpointError, ChronoSceneError, ShapeError
+from chronoscene.errors import CheckpointError, ChronoSceneError, MetricUnavailableError, ShapeError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import ImageEntry, Manifest, load_image, read_manifest
 from chronoscene.harness.files.records import (
@@ -234,13 +234,35 @@ def aggregate(
     return aggregates, dict(sorted(periods.items(), key=lambda item: int(item[0])))
 
 
+def metrics_of(record: RunRecord) -> set[str]:
+    """Return the names of the metrics that a run was scored by."""
+    return {row.metric for row in record.rows} | record.aggregates.get("macro", {}).keys()
+
+
+def check_installed(folder: Path, names: Set[str]) -> None:
+    """Check that the metrics of the run in a folder are known here.
+
+    Raises:
+        MetricUnavailableError: If one is not, as the package that has it is not installed.
+    """
+    if unknown := sorted(names - all_metrics().keys()):
+        raise MetricUnavailableError(
+            folder / ROWS_FILE,
+            expected="metrics that are installed",
+            found=shown(unknown),
+            todo="install the package that has them",
+        )
+
+
 def read_scored(folder: Path) -> RunRecord:
     """Read a finished run with the values of its views, and compare its means with these.
 
     Raises:
         CheckpointError: If a file is missing or damaged, or a mean is not that of the views.
+        MetricUnavailableError: If a metric is not installed.
     """
     run = read_with_rows(folder)
+    check_installed(folder, metrics_of(run))
     for region in (ALL, *run.regions):
         parts = run.regions.get(region, {"aggregates": run.aggregates, "periods": run.periods})
         stored = {name: values for part in parts.values() for name, values in part.items()}
@@ -290,6 +312,8 @@ def rescore(
 ) -> list[Rescored]:
     """Score every finished run below a folder again.
 
+    Runs whose record is damaged are not in the summary that is written.
+
     Args:
         runs: Folder that bench wrote.
         scorers: The metrics.
@@ -304,17 +328,25 @@ def rescore(
             runs, expected="a folder of runs", found="no finished run in it", todo="run bench first"
         )
     outcomes: list[Rescored] = []
+    readable = []
     for folder in folders:
         if progress is not None:
             progress(len(outcomes), len(folders))
-        outcomes.append(_rescore_one(runs, folder, scorers))
-    write_summary(runs)
+        try:
+            record = read_run(folder)
+        except CheckpointError as error:
+            outcomes.append(Rescored(folder, [], [], str(error)))
+            continue
+        readable.append(folder)
+        outcomes.append(_rescore_one(runs, folder, record, scorers))
+    if readable:
+        write_summary(runs, readable)
     return outcomes
 
 
-def _rescore_one(runs: Path, folder: Path, scorers: Scorers) -> Rescored:
+def _rescore_one(runs: Path, folder: Path, record: RunRecord, scorers: Scorers) -> Rescored:
     try:
-        record = read_run(folder)
+        check_installed(folder, metrics_of(record))  # or their values would be lost
         before, parts = record.aggregates, record.regions
         truth = ground_truth_folder(runs, record.scene)
         scores = score_folder(folder / PREDICTIONS, truth, scorers, fitted=record.fitted)
@@ -336,6 +368,8 @@ def keep_earlier(
 ) -> tuple[list[str], Scores]:
     """Keep earlier values of metrics that are not available here, or were not asked for.
 
+    Reasons for the absence of metrics that were not asked for are kept, too.
+
     They hold, as hashes prove that the images are the same; values of regions hold if the change
     masks are the same.
 
@@ -344,14 +378,15 @@ def keep_earlier(
     """
     there = record.aggregates.get("macro", {})
     kept = [name for name in scores.skipped if name in there]
+    known = {name: reason for name, reason in record.skipped.items() if name in unasked}
+    skipped = known | {name: why for name, why in scores.skipped.items() if name not in kept}
     if not kept and unasked.isdisjoint(there):
-        return [], scores
+        return [], replace(scores, skipped=skipped)
     holds = record.change_masks == scores.change_masks
     earlier = tuple(
         row
         for row in read_rows(folder)
         if (row.metric in kept or row.metric in unasked) and (holds or row.region == ALL)
     )
-    skipped = {name: reason for name, reason in scores.skipped.items() if name not in kept}
     rows = sorted(scores.rows + earlier, key=lambda row: row.view)
     return kept, replace(scores, rows=tuple(rows), skipped=skipped)

@@ -42,11 +42,16 @@ from chronoscene.harness.files.records import (
 )
 from chronoscene.harness.files.strategies import STRATEGIES, period_part
 from chronoscene.harness.score.regions import ALL
-from chronoscene.harness.score.scoring import put_scores, score_folder, score_stages
+from chronoscene.harness.score.scoring import (
+    check_installed,
+    metrics_of,
+    put_scores,
+    score_folder,
+    score_stages,
+)
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import sha256_of
-from chronoscene.io.wording import shown
 from chronoscene.metrics.registry import Scorers, all_metrics, make_scorers
 
 TOLERANCE = 1e-6
@@ -158,7 +163,7 @@ def verify(
     found = [Verified(str(folder)) for folder in folders]
     for run, folder in zip(found, folders, strict=True):
         run.attempt(partial(_read, run, folder))
-    recorded = {name for run in found if run.record for name in _metrics(run.record)}
+    recorded = {name for run in found if run.record for name in metrics_of(run.record)}
     scorers = make_scorers(recorded & all_metrics().keys(), lpips_weights=lpips_weights)
     for number, (run, folder) in enumerate(zip(found, folders, strict=True)):
         if progress is not None:
@@ -170,10 +175,6 @@ def verify(
 
 def _read(run: Verified, folder: Path) -> None:
     run.record = read_with_rows(folder)
-
-
-def _metrics(record: RunRecord) -> set[str]:
-    return {row.metric for row in record.rows} | record.aggregates.get("macro", {}).keys()
 
 
 def _verify_run(
@@ -252,14 +253,8 @@ def _score_again(
     run: Verified, folder: Path, record: RunRecord, truth: Path, scorers: Scorers
 ) -> RunRecord:
     """Return the record with scores and rows as computed; unchecked metrics keep their values."""
-    recorded = _metrics(record)
-    if unknown := sorted(recorded - all_metrics().keys()):
-        raise MetricUnavailableError(
-            folder / ROWS_FILE,
-            expected="metrics that are installed",
-            found=shown(unknown),
-            todo="install the package that has them",
-        )
+    recorded = metrics_of(record)
+    check_installed(folder, recorded)
     functions = {name: f for name, f in scorers.functions.items() if name in recorded}
     run.metrics = tuple(functions)
     run.unchecked = {name: scorers.skipped[name] for name in sorted(recorded - functions.keys())}

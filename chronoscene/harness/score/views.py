@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.harness.files.predictions import load_image, load_mask, read_manifest
+from chronoscene.harness.files.predictions import load_image, read_manifest
+from chronoscene.harness.score.regions import scored_mask
 from chronoscene.harness.score.scoring import match_views
 
 
@@ -25,17 +26,18 @@ class PredictedView:
     truth: NDArray[np.float32]
     """[H, W, 3]"""
     mask: NDArray[np.bool_] | None
-    """True where the photo counts; None if all of it does. [H, W]"""
+    """True where the photo is scored; None if all of it is. [H, W]"""
 
 
 def read_views(
-    predictions: Path, ground_truth: Path, *, stage: bool = False
+    predictions: Path, ground_truth: Path, *, fitted: str = "", stage: bool = False
 ) -> Iterator[PredictedView]:
     """Yield the predicted views that show the period of their photo.
 
     Args:
         predictions: Predictions of a run, or of one of its stages.
         ground_truth: The frozen photos.
+        fitted: As `RunRecord.fitted`.
         stage: As for `score_folder`.
 
     Raises:
@@ -46,5 +48,5 @@ def read_views(
         if entry.rendered_period == entry.camera_period:
             prediction = load_image(predictions, entry).astype(np.float32) / np.float32(255)
             photo = load_image(ground_truth, target).astype(np.float32) / np.float32(255)
-            mask = load_mask(ground_truth, target)
+            mask = scored_mask(ground_truth, target, fitted)
             yield PredictedView(entry.view, entry.camera_period, prediction, photo, mask)

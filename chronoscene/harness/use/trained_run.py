@@ -309,8 +309,8 @@ class TrainedRun:
         truth = ground_truth_folder(self.folder.resolve().parents[2], self.record.scene)
         staged = self.folder / STAGES / period_part(self.num_periods - 1)
         if self.stage is not None and staged.is_dir():
-            return read_views(staged, truth, stage=True)
-        return read_views(self.folder / PREDICTIONS, truth)
+            return read_views(staged, truth, fitted=self.record.fitted, stage=True)
+        return read_views(self.folder / PREDICTIONS, truth, fitted=self.record.fitted)
 
     def scene(self, root: Path | None = None) -> Scene:
         """Read the scene that the run was trained on, from ``root`` if it has moved.

@@ -42,6 +42,9 @@ def test_wrong_names_and_places_are_refused(tmp_path):
     for name in ("My-Method", "3dgs", "a_b", "a-"):
         with pytest.raises(ConfigError, match="small letters and digits"):
             run("new-method", name, "--out", tmp_path / "new")
+    for name in ("class", "torch", "chronogs"):
+        with pytest.raises(ConfigError, match=f"'{name}', whose package would stand in its place"):
+            run("new-method", name, "--out", tmp_path / "new")
     (tmp_path / "used").mkdir()
     (tmp_path / "used/file").touch()
     with pytest.raises(SceneError, match="new or empty folder"):

@@ -12,7 +12,7 @@ from chronoscene.cli import cli
 from chronoscene.errors import ChronoSceneError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import ImageWriter, safe_name
-from chronoscene.harness.files.records import PREDICTIONS, write_run
+from chronoscene.harness.files.records import PREDICTIONS, Failure, write_failure, write_run
 
 
 @pytest.fixture
@@ -84,3 +84,21 @@ def test_a_metric_that_is_not_there(runs, metric):
     with pytest.raises(ChronoSceneError, match=metric):
         compare(runs, "--metric", metric)
     assert not (runs / "figures").exists()
+
+
+@pytest.mark.parametrize("options", [(), ("--periods", "0:1")])
+def test_a_folder_with_failures_alone(tmp_path, options):
+    folder = tmp_path / "runs/plaza/m-joint-fast/seed0"
+    folder.mkdir(parents=True)
+    names = {"method": "m", "strategy": "joint", "preset": "fast", "scene": "plaza", "seed": 0}
+    write_failure(folder, Failure(**names, reason="no memory"))
+    with pytest.raises(ChronoSceneError, match="finished run, found runs that failed: no memory"):
+        compare(tmp_path / "runs", *options)
+
+
+def test_names_are_no_formulas(tmp_path):
+    runs = tmp_path / "runs"
+    labels = {"0": "$_$", "1": "1"}
+    write_scored(runs, scene="lot $5_ and $6^", title="A$_$B", period_labels=labels)
+    compare(runs)
+    assert len([*(runs / "figures").iterdir()]) == 2

@@ -212,6 +212,7 @@ def test_names_and_columns_can_be_chosen(tmp_path):
         (("--rename", "3DGS"), "--rename: expected OLD=NEW"),
         (("--columns", "macros"), "--columns: expected one of .*macro"),
         (("--columns", "macro", "--format", "csv"), "--columns: expected none with csv"),
+        (("--rename", "3DGS=x", "--format", "json"), "--rename: expected none with json"),
     ],
 )
 def test_names_and_columns_that_are_not_there_are_refused(tmp_path, option, message):
@@ -231,6 +232,21 @@ def test_a_region_has_tables_of_its_own(runs):
     assert table(runs, "--region", "changed").count("plaza (changed)") >= 2
     with pytest.raises(ConfigError, match="--region invariant: expected runs"):
         table(runs, "--region", "invariant")
+
+
+def test_a_metric_that_no_run_was_scored_by_is_said_to_be_absent(runs):
+    assert "absent: flip: no value: chronoscene score RUNS --metric flip" in table(
+        runs, "--metric", "flip"
+    )
+    assert "absent" not in table(runs, "--metric", "psnr")
+
+
+def test_a_metric_that_is_not_installed_is_named(tmp_path):
+    folder = write_scored(tmp_path / "runs")
+    rows = (folder / "rows.csv").read_text()
+    (folder / "rows.csv").write_text(rows.replace(",psnr,", ",mae,"))
+    with pytest.raises(MetricUnavailableError, match="metrics that are installed, found 'mae'"):
+        table(tmp_path / "runs")
 
 
 def test_wrong_input_is_told(runs, tmp_path):

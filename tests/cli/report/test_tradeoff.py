@@ -87,6 +87,12 @@ def test_limits_give_one_sentence_and_nothing_else(runs):
         tradeoff(runs, "--budget", "2s", "--target-psnr", 24)
 
 
+@pytest.mark.parametrize("option", [("--format", "csv"), ("--figures", "new")])
+def test_options_of_what_limits_leave_out_are_refused(runs, option):
+    with pytest.raises(ConfigError, match=f"{option[0]}: expected none with --budget"):
+        tradeoff(runs, "--budget", "1m", *option)
+
+
 def test_widths_are_not_compared(runs, undrawn):
     folder = runs / "plaza/quick-joint-fast/seed1"
     folder.mkdir()

@@ -19,6 +19,7 @@ from chronoscene.harness.report.summary import read_runs
 from chronoscene.harness.report.tables import format_runs
 from chronoscene.harness.run import runner
 from chronoscene.harness.score.scoring import rescore
+from chronoscene.harness.use.trained_run import open_run
 from chronoscene.metrics.registry import make_scorers
 
 FIELDS = {
@@ -114,6 +115,8 @@ def test_half_of_each_photo_gives_the_appearance_and_the_other_is_scored(bench_h
     assert run.fitted == "left half"
     assert run.aggregates["macro"]["psnr"] > read_run(whole.finished[0]).aggregates["macro"]["psnr"]
     assert not any(again.changes for again in rescore(tmp_path / "runs", make_scorers()))
+    for view in open_run(folder, plugin="toy_methods:MEAN").test_views():
+        assert view.mask[:, 12:].all() and not view.mask[:, :12].any()
     with pytest.raises(ConfigError, match="fixed --fit-half: expected a method whose appearance"):
         bench_here("FIXED", fit_half=True)
 
@@ -226,12 +229,20 @@ def test_two_commands_share_a_folder_run_by_run(bench_here, tmp_path, monkeypatc
     [
         ({"iterations": 5}, "--iterations: expected no --set iterations beside it"),
         ({"continue_to": 5}, "--continue-to: expected no --set iterations beside it"),
+        ({"budget_seconds": 1.0}, "--set iterations: expected no --budget beside it"),
         ({"continue_to": 5, "budget_seconds": 1.0}, "no --set iterations and no --budget beside"),
     ],
 )
 def test_two_lengths_are_refused(bench, changes, message):
     with pytest.raises(ConfigError, match=message):
         bench("MEAN", overrides={"mean.iterations": "7"}, **changes)
+
+
+def test_each_model_has_an_iteration(bench_here):
+    outcome, _ = bench_here("MEAN", strategies=("separate", "sequential", "joint"), iterations=1)
+    assert len(outcome.finished) == 1
+    expected = "mean --iterations: expected at least one for each of 2 models or stages"
+    assert all(failure.reason.startswith(expected) for failure in outcome.failures)
 
 
 def test_without_test_views_nothing_is_scored(scene_folder, bench_here, tmp_path):

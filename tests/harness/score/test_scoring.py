@@ -234,6 +234,32 @@ def test_an_edited_image_is_an_error_for_its_run_only(runs, scorers):
     assert [o.error for name, o in outcomes.items() if name != JOINT] == [None] * 3
 
 
+def test_a_damaged_record_is_an_error_for_its_run_only(runs, scorers):
+    (runs / JOINT / "run.json").write_text("{")
+    outcomes = {str(o.folder.relative_to(runs)): o for o in rescore(runs, scorers)}
+    assert "run.json" in outcomes[JOINT].error
+    assert [o.error for name, o in outcomes.items() if name != JOINT] == [None] * 3
+    assert len(json.loads((runs / "results.json").read_text())) == 3
+
+
+def test_values_of_a_metric_that_is_not_installed_are_not_lost(runs, scorers):
+    path = runs / JOINT / "rows.csv"
+    before = (runs / JOINT / "run.json").read_text().replace('"psnr"', '"mae"')
+    (runs / JOINT / "run.json").write_text(before)
+    path.write_text(path.read_text().replace(",psnr,", ",mae,"))
+    outcomes = {str(o.folder.relative_to(runs)): o for o in rescore(runs, scorers)}
+    assert "metrics that are installed, found 'mae'" in outcomes[JOINT].error
+    assert (runs / JOINT / "run.json").read_text() == before
+
+
+def test_reasons_for_the_absence_of_other_metrics_are_kept(runs):
+    record = read_run(runs / JOINT)
+    record.skipped = {"lpips_vgg": "no weights", "ssim_cc": "too small"}
+    write_run(runs / JOINT, record, read_rows(runs / JOINT))
+    rescore(runs, make_scorers(["psnr", "ssim_cc"]))
+    assert read_run(runs / JOINT).skipped == {"lpips_vgg": "no weights"}
+
+
 def test_edited_ground_truth_is_an_error(runs, scorers):
     path = runs / "ground_truth/ring/b/1.png.png"
     path.write_bytes(path.read_bytes() + b"\0")

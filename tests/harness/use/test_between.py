@@ -13,6 +13,7 @@ from PIL import Image
 from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.harness.files.predictions import to_bytes
+from chronoscene.harness.files.records import CHECKPOINT, read_with_rows, write_run
 from chronoscene.harness.score.between import FRACTIONS, BetweenScore, squared_distances
 from chronoscene.harness.use.between import measure_between, parse_dates
 from chronoscene.harness.use.trained_run import open_run
@@ -106,6 +107,16 @@ def test_periods_that_cannot_be(trained, text, message):
         parse_dates(open_run(trained["chronogs"]), text)
 
 
+def test_images_of_other_programs_are_left_out(runs, scene):
+    for folder in (runs / "ring").glob("3dgs*/seed0"):
+        shutil.rmtree(folder / CHECKPOINT)
+        run = read_with_rows(folder).model_copy(update={"threads": None})
+        write_run(folder, run, run.rows)
+    result = compare(runs, "--periods", "0:1", "--scene", scene)
+    assert "seed 0: left out, as another program made its images" in result.stderr
+    assert "ChronoGS" in result.stdout and "3DGS" not in result.stdout
+
+
 def test_a_run_without_its_model(runs, scene):
     shutil.rmtree(next(runs.glob("ring/chronogs*/seed0/checkpoint")))
     with pytest.raises(CheckpointError, match="expected a run with a model"):
@@ -117,3 +128,8 @@ def test_a_run_without_its_model(runs, scene):
 def test_options_without_effect_are_refused(runs, option):
     with pytest.raises(ConfigError, match=f"{option[0]}: expected none with --periods"):
         compare(runs, "--periods", "0:1", *option)
+
+
+def test_a_scene_without_effect_is_refused(runs, scene):
+    with pytest.raises(ConfigError, match="--scene: expected none without --periods"):
+        compare(runs, "--scene", scene)

@@ -121,7 +121,8 @@ def test_the_command_writes_a_folder(run, scene, tmp_path):
     colors = np.stack([vertex[name] for name in ("red", "green", "blue")], axis=1)
     assert (colors[gone] == (181, 18, 27)).all()
     assert (colors[vertex["known"] == 0] == (140, 140, 140)).all()
-    again = changes(run.folder, "--out", tmp_path / "again", "--between", "autumn", 0)
+    again = changes(run.folder, "--out", tmp_path / "again", *("--between", "autumn", 0) * 2)
+    assert len((tmp_path / "again/changes.csv").read_text().splitlines()) == 2
     assert "not scored: no change masks of test views" in again.stderr
     clouds = [tmp_path / name / "changes_0_1.ply" for name in ("out", "again")]
     assert clouds[0].read_bytes() == clouds[1].read_bytes()

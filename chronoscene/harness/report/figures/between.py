@@ -63,10 +63,10 @@ def draw_between(runs: Path, found: SceneBetween) -> Path:
 
 
 def _row_title(method: MethodBetween) -> str:
-    lines = [canvas.plain(line) for line in method.title.split("\n")]
+    title = canvas.plain_lines(method.title)
     if method.score is not None and not math.isnan(method.score.ratio):
-        lines.append(f"ratio {method.score.ratio:.2f}")
-    return "\n".join(lines)
+        title += f"\nratio {method.score.ratio:.2f}"
+    return title
 
 
 def between_table(found: SceneBetween) -> Table:

@@ -13,16 +13,11 @@ from numpy.typing import NDArray
 
 from chronoscene.figures import canvas
 from chronoscene.harness.files.ground_truth import truth_of
-from chronoscene.harness.files.predictions import (
-    ImageEntry,
-    load_image,
-    load_mask,
-    read_manifest,
-    safe_part,
-)
+from chronoscene.harness.files.predictions import ImageEntry, load_image, read_manifest, safe_part
 from chronoscene.harness.files.records import FIGURES, PREDICTIONS, RunRecord
 from chronoscene.harness.report.summary import kind_of
 from chronoscene.harness.report.tables import period_name
+from chronoscene.harness.score.regions import scored_mask
 from chronoscene.metrics.psnr_ssim import psnr
 
 CELL_WIDTH = 2.6  # Inches per image
@@ -41,6 +36,8 @@ class ShownRun:
     folder: Path
     """Its predictions."""
     entries: dict[str, ImageEntry]
+    fitted: str = ""
+    """Part of the photos, as `RunRecord.fitted`; the same for all methods in a figure."""
 
 
 def draw_figures(
@@ -99,7 +96,7 @@ def shown_run(record: RunRecord) -> ShownRun:
     """Read the list of predictions of a run."""
     predictions = record.folder / PREDICTIONS
     entries = {e.view: e for e in read_manifest(predictions).images}
-    return ShownRun(f"{record.title}\n{kind_of(record)}", predictions, entries)
+    return ShownRun(f"{record.title}\n{kind_of(record)}", predictions, entries, record.fitted)
 
 
 def _draw(
@@ -123,7 +120,7 @@ def _draw(
     for row, entry in zip(np.split(axes, len(rows)), rows, strict=True):
         image = _draw_row(row, truth, entry, methods, labels, errors=errors)
     for axis, title in zip(axes[0], ["ground truth", *(c.title for c in methods)], strict=True):
-        axis.set_title(title, fontsize=10)
+        axis.set_title(canvas.plain_lines(title), fontsize=10)
     if errors and image is not None:
         bar = figure.colorbar(
             image, ax=axes, location="bottom", shrink=0.4, aspect=40, pad=0.01, extend="max"
@@ -131,7 +128,7 @@ def _draw(
         bar.set_label("mean absolute error, share of full scale", fontsize=9)
     what = "error of the test views" if errors else "test views"
     where = "methods differ most" if len(methods) > 1 else "errors are largest"
-    figure.suptitle(f"{scene}: {what}; framed: where {where}", fontsize=12)
+    figure.suptitle(canvas.plain(f"{scene}: {what}; framed: where {where}"), fontsize=12)
     canvas.save(figure, path, bbox_inches="tight", pad_inches=0.1)
 
 
@@ -148,7 +145,7 @@ def _draw_row(
 
     ``axes`` has a second row for what is enlarged, or one row for error maps.
     """
-    photo, mask = load_image(truth, entry), load_mask(truth, entry)
+    photo, mask = load_image(truth, entry), scored_mask(truth, entry, methods[0].fitted)
     images = [load_image(run.folder, run.entries[entry.view]) for run in methods]
     maps = [mean_error(image, photo, mask) for image in images]
     window = where_methods_differ(maps)
@@ -160,8 +157,9 @@ def _draw_row(
             axis.imshow(image)
         axis.set_xlabel(psnr_text(image, photo, mask), fontsize=9)
     axes[0, 0].imshow(photo)
-    axes[0, 0].set_ylabel(shorten(period_name(entry.camera_period, labels), 26), fontsize=10)
-    axes[0, 0].set_xlabel(entry.view, fontsize=8)
+    period = shorten(period_name(entry.camera_period, labels), 26)
+    axes[0, 0].set_ylabel(canvas.plain(period), fontsize=10)
+    axes[0, 0].set_xlabel(canvas.plain(entry.view), fontsize=8)
     for axis in axes[0]:
         axis.add_patch(_frame(window))
     for below in axes[1:]:

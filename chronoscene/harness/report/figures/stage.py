@@ -35,19 +35,21 @@ def draw_stages(runs: Path, records: Sequence[RunRecord]) -> list[Path]:
             rows.setdefault(title, []).append(record)
     written = []
     for scene, rows in scenes.items():
+        there = next(iter(rows.values()))[0].aggregates["macro"]
+        metrics = [metric for metric in METRICS if metric in there]
+        if not metrics:  # trained on all photos
+            continue
         path = runs / FIGURES / f"{safe_part(scene)}_stages.png"
-        _draw(path, scene, rows)
+        _draw(path, scene, rows, metrics)
         written.append(path)
     return written
 
 
-def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
+def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]], metrics: Sequence[str]) -> None:
     """Draw one row of heat maps for each metric, one column for each method."""
     first = next(iter(rows.values()))[0]
     names = [period_name(i, first.period_labels) for i in first.period_labels]
-    names = [shorten(name, 20) for name in names]
-    there = first.aggregates["macro"]
-    metrics = [metric for metric in METRICS if metric in there]
+    names = [canvas.plain(shorten(name, 20)) for name in names]
     side = 1.2 + 0.45 * min(len(names), 2 * WRITTEN)
     size = ((0.6 + side) * len(rows) + 1.0, (0.8 + side) * len(metrics) + 0.6)
     figure = canvas.new_figure(*size, layout="constrained", dpi=150)
@@ -60,10 +62,10 @@ def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
         ]
         for axis, values, title in zip(row, found, rows, strict=True):
             image = _draw_matrix(axis, values, found, names, info)
-            axis.set_title(f"{title}\n{info.title}", fontsize=9)
+            axis.set_title(canvas.plain_lines(f"{title}\n{info.title}"), fontsize=9)
         figure.colorbar(image, ax=list(row), shrink=0.8, aspect=20)
     title = f"{scene}: test views of each period; below the red line, those of periods seen so far"
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(canvas.plain(title), fontsize=10)
     canvas.save(figure, path, bbox_inches="tight", pad_inches=0.1)
 
 

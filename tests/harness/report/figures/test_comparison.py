@@ -81,6 +81,24 @@ def test_what_a_mask_ignores_is_neither_error_nor_psnr(tmp_path):
         assert np.isnan(drawn[~mask]).all()
 
 
+def test_the_half_that_was_fitted_to_is_neither_error_nor_psnr(tmp_path):
+    photo = np.zeros((8, 8, 3), np.uint8)
+    image = photo.copy()
+    image[:, 4:] = 51
+    for name, pixels in (("t", photo), ("p", image)):
+        writer = ImageWriter(tmp_path / name)
+        writer.add("v", pixels, camera_period=0, rendered_period=0)
+        writer.close(kind="predictions", scene="s", scene_hash="h", details={})
+    (entry,) = read_manifest(tmp_path / "t").images
+    axes = Figure().subplots(1, 2, squeeze=False)
+    column = ShownRun("", tmp_path / "p", {"v": entry}, fitted="left half")
+    column.entries["v"] = read_manifest(tmp_path / "p").images[0]
+    shown = _draw_row(axes, tmp_path / "t", entry, [column], {}, errors=True)
+    assert axes[0, 1].get_xlabel() == "13.98 dB"
+    drawn = np.ma.filled(shown.get_array().astype(float), np.nan)
+    assert np.isnan(drawn[:, :4]).all() and np.allclose(drawn[:, 4:], 0.2)
+
+
 def test_what_is_enlarged_is_where_methods_differ():
     both, one = np.zeros((2, 40, 60))
     both[0:10, 0:15] = 0.9  # what all methods get wrong tells them apart nowhere

@@ -16,3 +16,19 @@ def test_runs_in_stages_are_drawn_and_no_others(bench_here, tmp_path):
     pixels = np.array(Image.open(runs / "figures/ring_stages.png").convert("RGB")).reshape(-1, 3)
     assert len(pixels) > 10_000
     assert (pixels == [255, 0, 0]).all(axis=1).any(), "the line around what was seen"
+
+
+def test_stages_without_test_views_have_no_figure(bench_here, tmp_path):
+    bench_here("toy_methods:MEAN", strategies=("sequential",))
+    (run,) = read_runs([tmp_path / "runs"])[0]
+    kinds = {kind: {} for kind in run.aggregates}
+    empty = {"aggregates": kinds, "periods": {}, "stages": {name: {} for name in run.stages}}
+    assert draw_stages(tmp_path / "runs", [run.model_copy(update=empty)]) == []
+
+
+def test_names_are_no_formulas(bench_here, tmp_path):
+    bench_here("toy_methods:MEAN", strategies=("sequential",))
+    (run,) = read_runs([tmp_path / "runs"])[0]
+    names = {"scene": "$_$", "title": "$_$", "period_labels": {"0": "$_$", "1": "1"}}
+    (path,) = draw_stages(tmp_path / "runs", [run.model_copy(update=names)])
+    assert path.stat().st_size > 1_000
