@@ -60,6 +60,7 @@ def encode_plain(cloud: GaussianCloud, *, antialiased: bool) -> bytes:
     flags = ANTIALIASED if antialiased else 0
     header = _HEADER.pack(MAGIC, VERSION, len(cloud), SH_DEGREE, fractional_bits, flags, 0)
     fixed = np.rint(cloud.means.astype(np.float64) * _FLIPPED * 2.0**fractional_bits)
+    fixed = fixed.clip(1 - 2**23, 2**23 - 1)
     with np.errstate(divide="ignore"):  # a scale of 0 is the smallest one
         log_scales = np.log(cloud.scales)
     parts: list[NDArray[Any]] = [
@@ -101,7 +102,7 @@ def _fractional_bits(means: NDArray[np.float32]) -> int:
     """Return 12, or what a scene beyond 2,048 units leaves; more where all is within 128 units."""
     largest = float(np.abs(means).max(initial=0.0))
     integer_bits = max(0, int(np.ceil(np.log2(largest + 1e-6))))
-    return min(max(12, 19 - integer_bits), 22 - integer_bits)
+    return max(0, min(max(12, 19 - integer_bits), 22 - integer_bits))
 
 
 def _to_byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:

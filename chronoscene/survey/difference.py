@@ -70,7 +70,7 @@ class Volumes:
     area_m2: float
     """Area of the cells that both periods know."""
     known_share: float
-    """Share of the polygon that this is."""
+    """Share that this is of the cells of the polygon that are on the map."""
     fill_m3: float
     """Volume of the cells that have risen significantly."""
     fill_interval_m3: float
@@ -108,7 +108,7 @@ def measure_volumes(difference: Difference, grid: Grid, polygon: str, inside: Ma
         for cells in (changed & rises, changed & ~rises, known)
     )
     area, share = float(known.sum() * grid.resolution**2), float(known.sum() / inside.sum())
-    return Volumes(polygon, area, share, *fill, -cut[0], cut[1], *net)
+    return Volumes(polygon, area, share, *fill, abs(cut[0]), cut[1], *net)
 
 
 def _volume(difference: Difference, cell: float, cells: Mask) -> tuple[float, float]:

@@ -30,12 +30,11 @@ from chronoscene.survey.distances import measure_distances
 from chronoscene.survey.figure import draw_difference
 from chronoscene.survey.grid import Grid, choose_grid, natural_resolution
 from chronoscene.survey.map_frame import MapFrame, map_frame
-from chronoscene.survey.rasters import read_polygons, write_raster
+from chronoscene.survey.rasters import WHOLE, read_polygons, write_raster
 from chronoscene.survey.surface import Surface, map_surface
 from chronoscene.survey.uncertainty import UNKNOWN, certified_registration
 from chronoscene.survey.views import depth_views
 
-WHOLE = "whole area"
 SUMMARY, VOLUMES = "survey.json", "volumes.csv"
 
 

@@ -16,6 +16,7 @@ from chronoscene.survey.grid import Grid
 from chronoscene.survey.map_frame import MapFrame
 
 NODATA = -9999.0
+WHOLE = "whole area"  # Name of the volumes of the whole map
 
 
 def write_raster(
@@ -58,7 +59,8 @@ def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Mask]:
     """Read the polygons of a GeoJSON file as the cells [H, W] whose centres are inside.
 
     Coordinates are in the system of its member ``crs`` if it has one; else longitude and latitude
-    if they can be, and map coordinates otherwise. Names are the property ``name``, or numbers.
+    if they can be, and map coordinates otherwise. Names are the property ``name``, or numbers; one
+    that is taken, also by `WHOLE`, gets the number, too.
 
     Raises:
         ConfigError: If the file is damaged, has other geometries, or lies outside the map.
@@ -75,8 +77,9 @@ def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Mask]:
         if not cells.any():
             raise _wrong(place, "a polygon on the map", "one outside", "check its coordinates")
         properties = feature.get("properties")
-        name = str(properties.get("name", number) if isinstance(properties, dict) else number)
-        named[name if name not in named else f"{name} ({number})"] = cells
+        given = properties.get("name") if isinstance(properties, dict) else None
+        name = str(number if given is None else given)
+        named[f"{name} ({number})" if name in (WHOLE, *named) else name] = cells
     if not named:
         raise _wrong(f"--area {path}", "polygons", "none", "draw at least one")
     return named

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -42,8 +43,9 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     photos: dict[str, tuple[int, int]]
-    """Size in bytes and time of the last change (ns) of photos, masks and the table of periods.
-    Photos that were merely copied again cost a call of `registration`, which looks into them."""
+    """Size in bytes and time of the last change (ns) of photos, masks and the table of periods, by
+    their paths from the folder of the photos. Photos that were merely copied again cost a call of
+    `registration`, which looks into them."""
     options: dict[str, str | int | None]
     """Options of the command by name."""
     steps: dict[str, StepRecord] = {}
@@ -64,7 +66,7 @@ def new_record(folder: Path, table: Path | None, options: Options) -> Record:
     """Make a record of what there is, without steps."""
     masks = folder.absolute().parent / MASKS
     files = [*photos_in(folder), *photos_in(masks), *([] if table is None else [table])]
-    status = {str(path): path.stat() for path in files}
+    status = {os.path.relpath(path, folder): path.stat() for path in files}
     photos = {name: (found.st_size, found.st_mtime_ns) for name, found in status.items()}
     return Record(photos=photos, options=dict(options))
 

@@ -10,7 +10,7 @@ from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.harness.plan.stop import parse_duration
 from chronoscene.io.staging import check_not_current, check_outside, sha256_of, write_text_atomic
 from chronoscene.io.wording import format_time
-from chronoscene.methods import build_config, load_spec
+from chronoscene.methods import build_config, is_preset_file, load_spec
 from chronoscene.registration.photos.captures import find_captures
 from chronoscene.registration.work_folder import fingerprint
 from chronoscene.workflow.record import (
@@ -141,6 +141,8 @@ def _key(project: Project, step: Step) -> str:
     """Fingerprint of all that the result of a step depends on."""
     record = project.record
     options = {name: record.options[name] for name in step.options}
+    if is_preset_file(preset := str(options.get("preset"))):
+        options["preset"] = sha256_of(Path(preset))
     if step.after is None:
         return fingerprint(step.name, options, record.photos)
     results = record.steps[step.after].results

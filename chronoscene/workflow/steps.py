@@ -24,10 +24,10 @@ from chronoscene.errors import (
     RegistrationError,
     SceneError,
 )
-from chronoscene.harness.files.predictions import encode_png, safe_part, to_bytes
+from chronoscene.harness.files.predictions import encode_png, to_bytes
 from chronoscene.harness.files.records import RUN_FILE
 from chronoscene.harness.use.changes import usual_pairs
-from chronoscene.harness.use.export import make_file, prepare
+from chronoscene.harness.use.export import make_file, period_files, prepare
 from chronoscene.harness.use.page import write_page
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
 from chronoscene.images.store import ImageStore
@@ -215,7 +215,7 @@ def _page(project: Project) -> Sequence[Path]:
 
 def _export(project: Project) -> Sequence[Path]:
     (run, scene), out = project.opened(), project.fresh("export")
-    files = {int(k): f"{safe_part(label)}.ply" for k, label in run.record.period_labels.items()}
+    files = period_files(run.record.period_labels, "ply")
     with staged_folder(out) as staged, project.progress("") as report:
         for period, name in files.items():
             report("periods", period, len(files))

@@ -165,3 +165,9 @@ def test_one_gaussian_alone_makes_a_file(kind):
     cloud = make_cloud(1)
     read = decode(kind, encode(kind, cloud, antialiased=False, up=UP))
     np.testing.assert_allclose(read.means, cloud.means, atol=2e-3)
+
+
+def test_centres_beyond_the_range_of_spz_become_its_limits():
+    far = replace(make_cloud(), means=np.full((40, 3), 1e8, np.float32))
+    made = decode("spz", encode("spz", far, antialiased=False, up=UP))
+    assert (made.means == 2**23 - 1).all()

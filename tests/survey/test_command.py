@@ -88,6 +88,15 @@ def test_two_runs_give_equal_files(site, tmp_path):
             assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path
 
 
+def test_a_pair_that_is_named_twice_is_compared_once(site, tmp_path):
+    run, _ = site
+    twice = ("--between", "0", "1", "--between", "after", "before")
+    assert survey(run, "--out", tmp_path / "out", "--resolution", "1", *twice).exit_code == 0
+    summary = json.loads((tmp_path / "out/survey.json").read_text())
+    assert [pair["periods"] for pair in summary["pairs"]] == [[0, 1]]
+    assert len((tmp_path / "out/volumes.csv").read_text().splitlines()) == 2
+
+
 def test_a_scene_without_a_model_has_points_alone(tmp_path):
     scene = scene_format.write(make_scene(tmp_path), tmp_path / "site", image_source="none")
     result = survey(scene, "--out", tmp_path / "out")

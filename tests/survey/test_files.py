@@ -113,6 +113,12 @@ def test_equal_names_stay_apart(tmp_path):
     assert list(read(tmp_path, data)) == ["pit", "pit (2)"]
 
 
+def test_names_that_are_empty_or_taken(tmp_path):
+    data = geojson(SQUARE, name=None)  # as QGIS writes an empty field
+    data["features"] += geojson(SQUARE, name="whole area")["features"]
+    assert list(read(tmp_path, data)) == ["1", "whole area (2)"]
+
+
 def test_properties_of_another_kind(tmp_path):
     data = geojson(SQUARE)
     data["features"][0]["properties"] = [3]

@@ -1,6 +1,7 @@
 """Steps are run once, continued, made anew where something changed, and never mixed."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -78,6 +79,15 @@ def test_photos_that_give_the_same_scene_renew_nothing_else(fake):
     (fake.photos / "2016/1.jpg").write_text("the same photo with other metadata")
     fake.go()
     assert fake.calls == ["register", "survey"]
+
+
+def test_the_same_photos_from_another_folder_are_the_same(fake, monkeypatch):
+    fake.go()
+    (fake.out / "register/out/sparse/0/images.bin").write_text("mended")
+    monkeypatch.chdir(fake.photos)
+    monkeypatch.setattr(type(fake), "photos", Path())
+    assert fake.go()[0] == ""
+    assert fake.calls == NAMES[1:]
 
 
 def test_masks_and_the_table_are_inputs(fake):
@@ -197,3 +207,11 @@ def test_a_step_under_way_has_no_result(fake, monkeypatch):
     fake.broken = ""
     fake.go()
     assert "Stopped" not in pages[0]
+
+
+def test_a_preset_file_counts_by_its_content(fake):
+    file = fake.root / "mine.toml"
+    for base, calls in (("fast", NAMES), ("fast", ["survey"]), ("balanced", NAMES[2:])):
+        file.write_text(f'method = "chronogs"\nbase = "{base}"\n')
+        fake.go(preset=str(file))
+        assert fake.calls == calls

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -61,8 +61,7 @@ def command(
     """
     run = open_run(folder, device=device, plugin=plugin)
     labels = [run.record.period_labels[str(period)] for period in range(run.num_periods)]
-    pairs = [parse_pair(labels, names) for names in between]
-    pairs = pairs or usual_pairs(run.num_periods)
+    pairs = parse_pairs(labels, between) or usual_pairs(run.num_periods)
     if not pairs:
         raise ConfigError(
             folder, expected="a run of two periods or more", found="one", todo="open another run"
@@ -89,6 +88,11 @@ def command(
     report_written(out)
     if not any(scores for _, scores in maps):
         say(f"not scored: no change masks of test views in {found.root / 'gt'}")
+
+
+def parse_pairs(labels: Sequence[str], between: Iterable[Sequence[str]]) -> list[tuple[int, int]]:
+    """Parse all values of ``--between`` as `parse_pair` does, each pair once."""
+    return list(dict.fromkeys(parse_pair(labels, names) for names in between))
 
 
 def parse_pair(labels: Sequence[str], names: Sequence[str]) -> tuple[int, int]:

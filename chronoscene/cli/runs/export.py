@@ -10,8 +10,7 @@ from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, check_place, emit, report_written
 from chronoscene.cli.progress import announce
 from chronoscene.errors import ConfigError
-from chronoscene.harness.files.predictions import safe_part
-from chronoscene.harness.use.export import make_file, prepare
+from chronoscene.harness.use.export import make_file, period_files, prepare
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
 from chronoscene.io.staging import check_outside, replacing, staged_folder
 from chronoscene.scene import Scene
@@ -77,9 +76,10 @@ def command(
         check_place("--out", out)
         read = _read_scene(run, scene)
         with staged_folder(out) as staged:
-            for number, label in run.record.period_labels.items():
-                data = _make(run, read, float(number), label, kind, viewers)
-                (staged / f"{safe_part(label)}{SUFFIXES[kind]}").write_bytes(data)
+            labels = run.record.period_labels
+            for number, name in period_files(labels, kind).items():
+                data = _make(run, read, float(number), labels[str(number)], kind, viewers)
+                (staged / name).write_bytes(data)
     report_written(out)
 
 

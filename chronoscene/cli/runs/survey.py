@@ -11,7 +11,7 @@ import click
 from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE
 from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
 from chronoscene.cli.progress import announce, progress_bar
-from chronoscene.cli.runs.changes import BETWEEN, parse_pair
+from chronoscene.cli.runs.changes import BETWEEN, parse_pairs
 from chronoscene.cli.scenes.reading import read_and_note
 from chronoscene.harness.files.records import RUN_FILE
 from chronoscene.harness.use.changes import usual_pairs
@@ -66,7 +66,7 @@ def command(
     found = read_and_note(source, None, None) if run is None else run.scene(scene)
     check_outside(out, [found.root], option="--out")
     labels = [period.label for period in found.periods]
-    pairs = [parse_pair(labels, names) for names in between] or usual_pairs(found.num_periods)
+    pairs = parse_pairs(labels, between) or usual_pairs(found.num_periods)
     options = SurveyOptions(tuple(pairs), resolution, area, crs)
     with staged_folder(out) as staged, progress_bar() as report:
         summary = write_survey(run, found, staged, options, report)

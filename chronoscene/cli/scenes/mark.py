@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE
-from chronoscene.cli.output import check_place, emit
+from chronoscene.cli.output import check_file, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.geodesy import read_reference_system
@@ -64,7 +64,7 @@ def command(
     """
     folder, table = find_captures(captures, table)
     check_outside(page, [folder], option="PAGE")
-    check_place("PAGE", page.absolute().parent)
+    check_file("PAGE", page)
     system = None if crs is None else read_reference_system("--crs", crs, error=ConfigError)
     points = None
     if tie_points is not None:

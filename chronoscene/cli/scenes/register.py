@@ -10,6 +10,7 @@ import click
 from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE
 from chronoscene.cli.output import check_place, emit, say
 from chronoscene.cli.progress import progress_bar
+from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
@@ -153,6 +154,7 @@ def command(
     """
     folder, table = find_captures(captures, table)
     options = Options(**settings)
+    _check_together(options, scene)
     for option, place in (("OUT", out), ("--work", options.work or options.work_folder(out))):
         check_outside(place, [folder, *([] if scene is None else [scene])], option=option)
         check_place(option, place)
@@ -176,6 +178,25 @@ def command(
     emit(text + "".join(f"note: {note}\n" for note in found.notes), None)
     if any(i.failed for i in inspections):
         context.exit(FAILED)
+
+
+def _check_together(options: Options, scene: Path | None) -> None:
+    """Refuse options that others would make ineffective.
+
+    Raises:
+        ConfigError: If there are such options.
+    """
+    for option, given, other, rules_out in (
+        ("--route", options.route is not None, "--into", scene is not None),
+        ("--calibration", options.calibration != "auto", "--cameras", options.cameras is not None),
+    ):
+        if given and rules_out:
+            raise ConfigError(
+                option,
+                expected=f"no {option} with {other}, where it has no effect",
+                found="both",
+                todo="omit one of them",
+            )
 
 
 def summary(registered: Registered, out: Path, crs: str | None) -> str:

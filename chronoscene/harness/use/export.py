@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from chronoscene import __version__, splat_files
 from chronoscene.arrays import Array
 from chronoscene.errors import ConfigError
-from chronoscene.harness.files.predictions import to_bytes
+from chronoscene.harness.files.predictions import safe_part, to_bytes
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
 from chronoscene.io.wording import counted
@@ -123,6 +124,19 @@ def make_file(
     loss = measure_loss(run, scene, period, in_training, _frames(scene, "test", period))
     comments = _comments(run, scene, period, prepared, loss)
     return Export(splat_files.with_comments(kind, data, comments), loss, comments)
+
+
+def period_files(labels: Mapping[str, str], kind: str) -> dict[int, str]:
+    """Name the files of all periods by their labels, with their numbers where two share one.
+
+    Args:
+        labels: Of the periods, by number.
+        kind: As for `make_file`.
+    """
+    count = Counter(labels.values())
+    names = {k: name if count[name] == 1 else f"{name}_{k}" for k, name in labels.items()}
+    suffix = splat_files.SUFFIXES[kind]
+    return {int(k): f"{safe_part(name)}{suffix}" for k, name in names.items()}
 
 
 def local_offset(scene: Scene) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ proposed from their dates), and a CSV table of image and period.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
@@ -17,11 +17,18 @@ from chronoscene.errors import SceneError
 from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.images.exif import read_exif, taken_at
+from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.photo import Capture, open_photo
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 PERIOD_GAP_DAYS = 14  # In one folder of photos, a gap of so many days begins a new period
+
+UNREAD = (
+    *(".heic", ".heif", ".avif", ".jxl", ".dng"),
+    *(".arw", ".cr2", ".cr3", ".nef", ".orf", ".raf", ".rw2"),
+)
+"""Extensions of photos that are left out, unless the same photo is there in another form."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,31 +95,54 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
     path, table = find_captures(Path(path), table)
     if table is not None:
         return _assemble(path, _from_table(path, table))
-    groups, left_out = _period_folders(path)
+    photos, unread = photos_in(path), _unread(path)
+    groups, left_out = _period_folders(path, photos)
     if groups:
-        return _assemble(path, groups, left_out=left_out)
-    return _assemble(path, *_by_date(path, photos_in(path)))
+        return _assemble(path, groups, left_out=[*left_out, *unread])
+    groups, proposed, left_out = _by_date(path, photos)
+    return _assemble(path, groups, proposed, [*left_out, *unread])
 
 
 def photos_in(folder: Path) -> list[Path]:
-    """List image files below a folder, sorted, without hidden files and folders."""
-    found = [
-        p
-        for p in folder.rglob("*")
-        if p.suffix.lower() in IMAGE_SUFFIXES
-        and not any(part.startswith(".") for part in p.relative_to(folder).parts)
-        and p.is_file()
-    ]
+    """List image files below a folder, sorted, without hidden files and folders; links count."""
+    found = (p for p in _files_in(folder) if p.suffix.lower() in IMAGE_SUFFIXES)
     return sorted(found, key=lambda p: p.relative_to(folder).as_posix())
 
 
-def _period_folders(root: Path) -> tuple[list[_Listed], list[str]]:
+def _files_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
+    """Yield the files below a folder; ``above`` are those around it, to which links may lead."""
+    real = folder.resolve()
+    if real in above or not real.is_dir():
+        return
+    for path in folder.iterdir():
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            yield from _files_in(path, (*above, real))
+        elif path.is_file():
+            yield path
+
+
+def _unread(root: Path) -> list[str]:
+    """Name photos in formats that are not read; nothing if there are none."""
+    files = sorted(_files_in(root))
+    known = {p.with_suffix("") for p in files if p.suffix.lower() in IMAGE_SUFFIXES}
+    found = [p for p in files if p.suffix.lower() in UNREAD and p.with_suffix("") not in known]
+    if not found:
+        return []
+    kinds = ", ".join(sorted({p.suffix.lower() for p in found}))
+    return [
+        f"{counted(len(found), 'photo')} in formats that are not read ({kinds}), such as "
+        f"{found[0].relative_to(root)}; they are left out; convert them to JPEG"
+    ]
+
+
+def _period_folders(root: Path, photos: Sequence[Path]) -> tuple[list[_Listed], list[str]]:
     """List photos by subfolder, and say which lie beside these.
 
     None are listed with only one subfolder, or if more photos lie beside the subfolders than in
     them: those are no periods.
     """
-    photos = photos_in(root)
     beside = [p for p in photos if p.parent == root]
     inside = [p for p in photos if p.parent != root]
     tops = {p.relative_to(root).parts[0] for p in inside}
@@ -209,7 +239,7 @@ def _assemble(
         left_out: What is said about photos without a period.
     """
     if not listed:
-        raise _nothing(root, "no image files")
+        raise _nothing(root, left_out[0] if left_out else "no image files")
     order = _ordered_labels(listed)
     images, refused = [], []
     numbers = [order.index(item.label) for item in listed]
@@ -326,7 +356,7 @@ def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
 
 
 def period_date(label: str, dates: Iterable[date]) -> str | None:
-    """Find the day, month or year that all photos of a period share."""
+    """Find the day, month or year that all photos of a period share; the median year if none."""
     days = sorted(dates)
     if not days:
         return label if is_iso_date(label) else None

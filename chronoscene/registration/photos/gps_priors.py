@@ -72,8 +72,11 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     spread = np.ptp(enu[plausible], axis=0) if plausible.any() else np.zeros(3)
     if plausible.sum() < 3 or spread.max() < CONSTANT_METRES:
         remarks.append(
-            f"all GPS positions lie within {CONSTANT_METRES} m: they do not describe the motion of "
-            "the camera"
+            f"{int(plausible.sum())} of {count} photos have a plausible GPS position: too few to "
+            "define a frame"
+            if plausible.sum() < 3
+            else f"all GPS positions lie within {CONSTANT_METRES} m: they do not describe the "
+            "motion of the camera"
         )
         return Positions(None, nothing, nothing, none, tuple(remarks))
     remarks.insert(0, f"{int(has.sum())} of {count} photos have a GPS position; frame {frame.crs}")

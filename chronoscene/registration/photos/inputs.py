@@ -203,13 +203,11 @@ def _check_enough(
 
 
 def _new_period(captures: Captures) -> tuple[str, str | None]:
-    """Label and date of all captures as one period: the date as far as they share it."""
+    """Label of all captures as one period, and its date by `period_date`."""
     periods = captures.periods
     label = periods[0].label if len(periods) == 1 else captures.root.name
-    days = sorted(c.taken.date().isoformat() for c in captures.images if c.taken is not None)
-    if not days:
-        return label, None
-    return label, days[0] if days[0] == days[-1] else days[0][:4]
+    known = [c for c in captures.images if c.path in captures.undisputed]
+    return label, period_date(label, [c.taken.date() for c in known if c.taken is not None])
 
 
 def _as_new_period(captures: Sequence[Capture], scene: Scene, label: str) -> tuple[Capture, ...]:

@@ -29,9 +29,9 @@ COLUMNS = {
     "image": ("image", "image name", "image_name", "file", "photo"),
     "x": ("x", "im_x", "u", "col"),
     "y": ("y", "im_y", "v", "row"),
-    "world x": ("world x", "world_x", "wx", "geo_x", "east", "longitude"),
-    "world y": ("world y", "world_y", "wy", "geo_y", "north", "latitude"),
-    "world z": ("world z", "world_z", "wz", "geo_z", "up", "height", "altitude"),
+    "world x": ("world x", "world_x", "wx", "geo_x", "east", "easting", "longitude", "lon"),
+    "world y": ("world y", "world_y", "wy", "geo_y", "north", "northing", "latitude", "lat"),
+    "world z": ("world z", "world_z", "wz", "geo_z", "up", "height", "altitude", "elevation"),
     "role": ("role",),
     "sigma x": ("sx", "sigma_x", "accuracy_x"),
     "sigma y": ("sy", "sigma_y", "accuracy_y"),
@@ -166,17 +166,21 @@ class _Row:
 
 
 def _assemble(path: Path, rows: Iterable[_Row], crs: ReferenceSystem | None) -> TiePoints:
-    """Group clicks by point; refuse two places or two roles of one point."""
+    """Group clicks by point; refuse two places, roles or accuracies of one point."""
     clicks: dict[str, dict[str, Click]] = {}
     worlds: dict[str, Place] = {}
     sigmas: dict[str, Place] = {}
     roles: dict[str, Role] = {}
+    stated: dict[str, int] = {}
     moved: dict[str, int] = {}
     for row in rows:
         name, click, world, role = row.point, row.click, row.world, row.role
         mine = clicks.setdefault(name, {})
-        if row.sigma is not None:
-            sigmas[name] = row.sigma
+        if row.sigma is not None and sigmas.setdefault(name, row.sigma) != row.sigma:
+            raise _wrong(
+                path, click.line, f"the same accuracies of point {name!r} on all its lines",
+                f"{row.sigma} after {sigmas[name]}", "correct one of them",
+            )  # fmt: skip
         if click.image in mine:
             raise _wrong(
                 path, click.line, f"one click of point {name!r} in {click.image}",
@@ -186,15 +190,18 @@ def _assemble(path: Path, rows: Iterable[_Row], crs: ReferenceSystem | None) -> 
             mine[click.image] = click
         if world is not None and worlds.setdefault(name, world) != world:
             moved.setdefault(name, click.line)
-        if role is not None and name not in worlds:
-            raise _wrong(
-                path, click.line, f"world coordinates of the {role} point {name!r}", "none",
-                "add them, or leave the role empty",
-            )  # fmt: skip
         if role is not None and roles.setdefault(name, role) != role:
             raise _wrong(
                 path, click.line, f"the same role of point {name!r} on all its lines",
                 f"{role} after {roles[name]}", "correct one of them",
+            )  # fmt: skip
+        if role is not None:
+            stated.setdefault(name, click.line)
+    for name, line in stated.items():
+        if name not in worlds:
+            raise _wrong(
+                path, line, f"world coordinates of the {roles[name]} point {name!r}", "none",
+                "add them, or leave the role empty",
             )  # fmt: skip
     if moved:
         named = ", ".join(f"{name} (line {line})" for name, line in moved.items())
@@ -320,7 +327,8 @@ def _projection(path: Path, line: str) -> ReferenceSystem:
 def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int | None]:
     """Index of the model's image for each image with clicks; None where the model lacks it.
 
-    An image may be named by its whole path or by the end of it, where that is unique.
+    An image may be named by its whole path or by the end of it, where that is unique, and as it
+    was before registration, which replaces blanks and converts some photos to PNG.
 
     Raises:
         SceneError: If the end of a path fits several images, or no click fits the model at all.
@@ -330,15 +338,14 @@ def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int |
     for click in (c for p in tie_points.points for c in p.clicks):
         if click.image in found:
             continue
-        plain = re.sub(r"\s", "_", PurePosixPath(click.image.replace("\\", "/")).as_posix())
-        ends = [n for n in names if n == plain or n.endswith(f"/{plain}")]
-        if plain not in index and len(ends) > 1:
+        ends = _names_of(click.image, names)
+        if len(ends) > 1:
             raise _wrong(
                 tie_points.path, click.line, "the name of one image",
                 f"{click.image!r}, which fits {ends[0]} and {ends[1]}",
                 "write the name with its folder",
             )  # fmt: skip
-        found[click.image] = index.get(plain, index[ends[0]] if ends else None)
+        found[click.image] = index[ends[0]] if ends else None
     if found and all(i is None for i in found.values()):
         first = next(c for p in tie_points.points for c in p.clicks)
         raise _wrong(
@@ -346,6 +353,16 @@ def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int |
             f"{names[0] if names else '(there are none)'}", first.image, "correct the names",
         )  # fmt: skip
     return found
+
+
+def _names_of(image: str, names: Sequence[str]) -> list[str]:
+    """Names that an image may mean: as it is written, or as `place_photos` renames a photo."""
+    written = PurePosixPath(image.replace("\\", "/")).as_posix()
+    plain = re.sub(r"\s", "_", written)
+    for name in (written, plain, f"{plain}.png"):
+        if found := [name] if name in names else [n for n in names if n.endswith(f"/{name}")]:
+            return found
+    return []
 
 
 def _number(path: Path, line: int, text: str, what: str) -> float:

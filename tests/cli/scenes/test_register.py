@@ -146,3 +146,17 @@ def test_the_reference_system_is_checked_before_any_work(
     assert isinstance(done.exception, ConfigError), done.output
     assert done.exception.place == "--crs" and found in done.exception.found
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "other"),
+    [("--route", "separate", "--into"), ("--calibration", "per-period", "--cameras")],
+)
+def test_options_without_an_effect_are_refused(
+    tmp_path: Path, option: str, value: str, other: str
+) -> None:
+    (tmp_path / "given").touch()
+    done = call(
+        photos(tmp_path / "in/a", 3), tmp_path / "out", option, value, other, tmp_path / "given"
+    )
+    assert str(done.exception).startswith(f"{option}: expected no {option} with {other}")

@@ -86,6 +86,11 @@ def test_training_views_lose_what_is_allowed_and_hardly_less(copied, monkeypatch
     assert 0.3 < training_psnr(folder) - training_psnr(out) <= 0.5 + 1e-6
 
 
+def test_a_loss_means_nothing_to_the_plain_form(trained):
+    with pytest.raises(ConfigError, match="--max-loss: expected no --plain"):
+        compress(trained["chronogs"], "--plain", "--max-loss", "0.5")
+
+
 def test_a_damaged_model_is_refused(copied):
     out, _ = compress(copied("chronogs"), "--plain")
     file = out / "checkpoint/model.compressed"

@@ -237,3 +237,9 @@ def test_an_earlier_stage_is_exported_from_the_views_that_it_saw(bench_here, tmp
     arguments = ["render", str(folder), "--period", "0", "--out", str(pictures), "--stage", "0"]
     assert CliRunner().invoke(cli, arguments, catch_exceptions=False).exit_code == 0
     assert len(list(pictures.rglob("*.png"))) == 3
+
+
+def test_periods_of_the_same_label_have_files_of_their_own():
+    labels = {"0": "May", "1": "June", "2": "May"}
+    names = {0: "May_0.ply", 1: "June.ply", 2: "May_2.ply"}
+    assert exporting.period_files(labels, "ply") == names

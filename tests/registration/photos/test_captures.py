@@ -32,6 +32,28 @@ def test_folders_are_periods_ordered_by_the_dates_of_their_photos(tmp_path: Path
     assert found.images[0].taken == datetime(2016, 5, 1, 10)
 
 
+def test_folders_may_be_links(tmp_path: Path) -> None:
+    photo(tmp_path / "disk" / "2023" / "b.jpg")
+    photo(tmp_path / "site" / "2016" / "a.jpg")
+    (tmp_path / "site" / "2023").symlink_to(tmp_path / "disk" / "2023")
+    (tmp_path / "site" / "2016" / "up").symlink_to(tmp_path / "site")
+    found = read_captures(tmp_path / "site")
+    assert [c.name for c in found.images] == ["2016/a.jpg", "2023/b.jpg"]
+
+
+def test_photos_in_formats_that_are_not_read_are_named(tmp_path: Path) -> None:
+    (tmp_path / "2023").mkdir()
+    (tmp_path / "2023" / "b.HEIC").touch()
+    with pytest.raises(SceneError, match=r"found 1 photo in formats that are not read \(.heic\)"):
+        read_captures(tmp_path)
+    (tmp_path / "2023" / "a.dng").touch()
+    photo(tmp_path / "2023" / "a.jpg")
+    for name in ("2023/c.jpg", "2016/c.jpg"):
+        photo(tmp_path / name)
+        (note,) = read_captures(tmp_path).notes
+        assert note.startswith("1 photo in formats") and "2023/b.HEIC" in note
+
+
 def test_folders_without_dates_are_in_natural_order(tmp_path: Path) -> None:
     for label in ("t10", "t2", "t1"):
         photo(tmp_path / label / "x.png")

@@ -98,6 +98,10 @@ def test_too_few_positions_are_no_frame() -> None:
     offsets = np.full((6, 2), np.nan)
     offsets[:2] = 0.0
     assert locate(captures(offsets)).georeference is None
+    offsets[:3] = [[0, 0], [100, 0], [50_000, 0]]
+    found = locate(captures(offsets))
+    assert found.georeference is None
+    assert found.remarks[-1].startswith("2 of 6 photos have a plausible GPS position: too few")
 
 
 def test_heights_are_of_one_kind() -> None:

@@ -160,3 +160,13 @@ def test_photos_that_are_not_registered_do_not_date_a_period(folder: Path) -> No
     first = [p.label for p in captures.periods].index("before")
     assert found.dates_of(frozenset(c.name for c in captures.images))[first] == "2016"
     assert found.dates_of(frozenset({"before/0.jpg", "before/1.jpg"}))[first] == "2016-03-01"
+
+
+def test_captures_that_become_one_period_have_the_date_that_they_share(folder: Path) -> None:
+    for i, day in enumerate(("2020:05:01", "2020:05:03")):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x9003] = f"{day} 12:00:00"
+        save(folder / f"shots/{i}.jpg", i, exif=exif)
+        save(folder / f"2021-03/{i}.jpg", i)
+    assert inputs._new_period(read_captures(folder / "shots")) == ("2020-05-01", "2020-05")
+    assert inputs._new_period(read_captures(folder / "2021-03")) == ("2021-03", "2021-03")

@@ -73,6 +73,18 @@ def test_the_command_writes_a_page(captures: Path, tmp_path: Path) -> None:
     assert (tmp_path / "p.html").stat().st_size > 10_000
 
 
+def test_a_page_that_cannot_be_written_is_refused_before_the_photos_are_read(
+    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from click.testing import CliRunner
+
+    monkeypatch.delattr("chronoscene.cli.scenes.mark.read_captures")
+    for page, found in ((tmp_path, "Is a directory"), (tmp_path / "no/p.html", "No such file")):
+        done = CliRunner().invoke(command, [str(captures), str(page)])
+        assert str(done.exception).startswith(f"PAGE {page}: expected a file that can be written, ")
+        assert found in str(done.exception)
+
+
 class Opened:
     """The page in a browser."""
 

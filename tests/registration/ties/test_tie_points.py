@@ -118,6 +118,7 @@ def test_odm_list(tmp_path: Path) -> None:
         ("point,image,x,y,X,Y,Z,role\np,a.jpg,1,2,3,4,5,guess\n", 2, "'guess'"),
         ("point,image,x,y,X,Y,Z,role\np,a.jpg,1,2,,,,check\n", 2, "coordinates of the check"),
         ("p,a.jpg,1,2,3,4,5,check\np,b.jpg,1,2,3,4,5,control\n", 2, "control after check"),
+        ("p,a.jpg,1,2,3,4,5,,1,1,1\np,b.jpg,1,2,3,4,5,,1,1,2\n", 2, "the same accuracies"),
         ("EPSG:32632\n1 2 3 4\n", 2, "4 fields"),
         ("EPSG:32632\n1 2 3 4 z a.jpg\n", 2, "'z'"),
         ("# crs: EPSG:999999\np,a.jpg,1,2\n", 1, "PROJ"),
@@ -136,6 +137,26 @@ def test_wrong_lines_are_named(tmp_path: Path, text: str, line: int, words: str)
 def test_files_without_clicks(tmp_path: Path, text: str) -> None:
     with pytest.raises(SceneError, match="tie points"):
         read(tmp_path, text)
+
+
+def test_a_role_may_stand_before_the_coordinates(tmp_path: Path) -> None:
+    lines = ["p,a.jpg,1,2,,,,check", "p,b.jpg,1,2,3,4,5,"]
+    for order in (lines, lines[::-1]):
+        (point,) = read(tmp_path, "\n".join(["point,image,x,y,X,Y,Z,role", *order])).points
+        assert (point.role, point.world) == ("check", (3.0, 4.0, 5.0))
+
+
+def test_usual_names_of_world_coordinates(tmp_path: Path) -> None:
+    for names in ("Easting,Northing,Elevation", "lon,lat,height", "east,north,up"):
+        (point,) = read(tmp_path, f"point,image,x,y,{names}\np,a.jpg,1,2,3,4,5\n").points
+        assert point.world == (3.0, 4.0, 5.0)
+
+
+def test_images_may_have_their_names_of_before_registration(tmp_path: Path) -> None:
+    points = read(tmp_path, "p,2016/a b.jpg,1,2\np,c d.tif,1,2\n")
+    before, after = ("2016/a b.jpg", "2016/c d.tif"), ("2016/a_b.jpg", "2016/c_d.tif.png")
+    for names in (before, after):
+        assert match_images(points, names) == {"2016/a b.jpg": 0, "c d.tif": 1}
 
 
 def test_images_are_found_by_the_end_of_their_path(tmp_path: Path) -> None:
