@@ -193,7 +193,8 @@ def _median_depth(frames: Sequence[Frame], xyz: NDArray[np.float64]) -> float:
         pixels = project_points(frame.camera, seen)
         size = (frame.camera.width, frame.camera.height)
         inside = ((pixels >= 0) & (pixels <= size)).all(axis=1)
-        depths += [np.median(seen[inside, 2])] if inside.any() else []
+        if inside.any():
+            depths.append(np.median(seen[inside, 2]))
     return float(np.median(depths)) if depths else 0.0
 
 
