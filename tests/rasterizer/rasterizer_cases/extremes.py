@@ -7,13 +7,14 @@ divided, is an extreme one too.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from chronoscene.harness.plan.parts import training_frame
+from chronoscene.scene import Camera, Frame, Points
 from chronoscene.scene.geometry import quaternion_from_rotation, rotation_from_quaternion
 
 from .scenes import SmallScene, random_scene
@@ -112,10 +113,11 @@ def rounded(scene: SmallScene) -> SmallScene:
 
 def in_training_frame(scene: SmallScene) -> SmallScene:
     """Move a scene into the training frame, as the bench does, but keep float64."""
-    frames = [SimpleNamespace(cam_from_world=pose, period=0) for pose in scene.viewmats]
-    described: Any = SimpleNamespace(
-        num_periods=1, select=lambda split: frames, points=SimpleNamespace(xyz=scene.means)
-    )
+    (fx, _, cx), (_, fy, cy), _ = scene.Ks[0].tolist()
+    camera = Camera(1, "PINHOLE", scene.width, scene.height, (fx, fy, cx, cy))
+    frames = [Frame(f"{i}", i, camera, pose, 0, "train") for i, pose in enumerate(scene.viewmats)]
+    points = replace(Points.empty(), ids=np.arange(len(scene.means)), xyz=scene.means)
+    described: Any = SimpleNamespace(num_periods=1, select=lambda split: frames, points=points)
     training_from_world = training_frame(described)
     return scene.with_(
         means=training_from_world.apply(scene.means),
