@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from chronoscene.errors import ConfigError
 from chronoscene.formats import format_names, load_format
@@ -55,6 +56,25 @@ LPIPS_WEIGHTS = click.option(
 )
 
 RUNS_OUT = click.option("--out", type=FOLDER, default=Path("runs"), help="Folder for the runs.")
+
+
+def refuse_options(names: Iterable[str], condition: str) -> None:
+    """Refuse options of the running command that were typed and have no effect.
+
+    Args:
+        names: Of their parameters.
+        condition: Why they have none, such as ``with --periods``.
+
+    Raises:
+        ConfigError: If one was typed.
+    """
+    context = click.get_current_context()
+    flags = {parameter.name: parameter.opts[0] for parameter in context.command.params}
+    for name in names:
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise ConfigError(
+                flags[name], expected=f"none {condition}", found="one", todo="leave one out"
+            )
 
 
 def split_list(option: str, text: str) -> tuple[str, ...]:

@@ -68,8 +68,8 @@ class TrainingSet:
     camera_extent: float
     """1.1 times the largest distance of a training camera from their mean, in training units."""
     scene_extent: float
-    """The same, or 0.55 times the median depth of the points where that is larger: where the
-    cameras stand close together, before what they see."""
+    """`camera_extent`, or 0.55 times the median depth of the points where that is larger: where
+    the cameras stand close together, before what they see."""
     background: NDArray[np.float32]
     """Colour behind everything, 0..1. [3]"""
     load_image: Callable[[int], NDArray[np.uint8]]

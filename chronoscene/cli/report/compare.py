@@ -6,9 +6,8 @@ from functools import partial
 from pathlib import Path
 
 import click
-from click.core import ParameterSource
 
-from chronoscene.cli.options import EXISTING_FOLDER, FILE, PLUGIN, SCENE
+from chronoscene.cli.options import EXISTING_FOLDER, FILE, PLUGIN, SCENE, refuse_options
 from chronoscene.cli.output import (
     A_FILE,
     check_file,
@@ -87,8 +86,10 @@ def command(
     """
     check_file("--out", out)
     check_file("--html", html)
-    _refuse_options("without" if periods is None else "with")
-    if periods is not None:
+    if periods is None:
+        refuse_options(("scene", "plugin"), "without --periods")
+    else:
+        refuse_options(("views", "metric", "html"), "with --periods")
         compare_between(runs, periods, style, out, scene, plugin)
         return
     metric = metric_info(metric).name
@@ -122,16 +123,6 @@ def _finished(runs: Path) -> tuple[list[RunRecord], list[Failure]]:
             todo="correct that, and run bench again",
         )
     return records, failures
-
-
-def _refuse_options(way: str) -> None:
-    """Refuse options that have no effect ``with`` or ``without`` --periods."""
-    context = click.get_current_context()
-    for name in ("views", "metric", "html") if way == "with" else ("scene", "plugin"):
-        if context.get_parameter_source(name) == ParameterSource.COMMANDLINE:
-            raise ConfigError(
-                f"--{name}", expected=f"none {way} --periods", found="one", todo="leave one out"
-            )
 
 
 def compare_between(

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
-from chronoscene.cli.options import FOLDER, RUNS
+from chronoscene.cli.options import FOLDER, RUNS, refuse_options
 from chronoscene.cli.output import (
     FORMAT,
     OUT_FILE,
@@ -84,7 +83,7 @@ def command(
     typed = {"--budget": budget, "--max-bytes": max_bytes, "--target-psnr": target}
     given = [f"{name} {value}" for name, value in typed.items() if value is not None]
     if given:
-        _refuse_options()
+        refuse_options(("style", "figures"), "with --budget, --max-bytes or --target-psnr")
         limits = Limits(
             seconds=None if budget is None else parse_duration(budget),
             size=None if max_bytes is None else parse_size(max_bytes),
@@ -101,19 +100,6 @@ def command(
         with writing_to("--figures", figure):
             draw(points, figure, records)
         report_written(figure)
-
-
-def _refuse_options() -> None:
-    """Refuse options that have no effect where only the configuration to use is printed."""
-    context = click.get_current_context()
-    for parameter, option in (("style", "--format"), ("figures", "--figures")):
-        if context.get_parameter_source(parameter) == ParameterSource.COMMANDLINE:
-            raise ConfigError(
-                option,
-                expected="none with --budget, --max-bytes or --target-psnr",
-                found="one",
-                todo="leave one out",
-            )
 
 
 def parse_size(text: str) -> float:
