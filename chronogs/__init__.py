@@ -19,20 +19,19 @@ _FULL: dict[str, Any] = {
 the sparse cloud, so the unit of the scene does not matter."""
 
 _SHORT: dict[str, Any] = _FULL | {
-    "offsets_per_anchor": 5,
     "base_dim": 28,
     "period_dim": 4,
     "global_init": "zero",
     "trim_global": True,
     "merge_share": 0.01,
-    "unused_share": 0.06,
+    "unused_share": 0.01,
     "feature_lr": (0.015, 0.0075),
     "opacity_lr": (0.004, 0.0004),
     "color_lr": (0.008, 0.0005),
     "antialiased": True,
     "cooldown": 0.2,
 }
-"""Better with two fifths of the numbers: what-a-scene-requires.md and generalisation.md in
+"""Fewer numbers for each period, and other rates: what-a-scene-requires.md and tuning.md in
 docs/experiments have the trials."""
 
 _TEXT: dict[str, Any] = {
