@@ -74,18 +74,28 @@ class ReferenceSystem:
     unit: float = 1.0
     """Metres in a unit of its coordinates, such as a foot; 1 for degrees, whose heights are in
     metres."""
+    axes: tuple[str, ...] = ("east", "north")
+    """Directions of its axes."""
+
+    @property
+    def is_east_north(self) -> bool:
+        """False if an axis points the other way; around a pole, both point along meridians."""
+        return set(self.axes) in ({"east", "north"}, {"north"}, {"south"})
 
     def to_local(self, frame: Georeference, xyz: Array) -> Array:
         """Coordinates in this system to a local frame; not finite outside its area. [N, 3]"""
-        longitude, latitude = _to_wgs84(self.text).transform(xyz[:, 0], xyz[:, 1])
-        return frame.to_enu(latitude, longitude, self.unit * xyz[:, 2])
+        # Heights stay as they are, but those far above an ellipsoid shift its change to another.
+        longitude, latitude, height = _to_wgs84(self.text).transform(
+            xyz[:, 0], xyz[:, 1], self.unit * xyz[:, 2]
+        )
+        return frame.to_enu(latitude, longitude, height)
 
     def from_local(self, frame: Georeference, enu: Array) -> Array:
         """Inverse of `to_local`. [N, 3]"""
         latitude, longitude, height = frame.to_geodetic(enu).T
         inverse: Any = "INVERSE"
-        x, y = _to_wgs84(self.text).transform(longitude, latitude, direction=inverse)
-        return np.column_stack([x, y, height / self.unit])
+        x, y, z = _to_wgs84(self.text).transform(longitude, latitude, height, direction=inverse)
+        return np.column_stack([x, y, z / self.unit])
 
     def derivative(self, frame: Georeference, enu: Array) -> Array:
         """Derivative of the coordinates by those of the local frame. [N, 3] -> [N, 3, 3]"""
@@ -115,7 +125,7 @@ def read_reference_system(
     try:
         crs = pyproj.CRS.from_user_input(text)
     except pyproj.exceptions.CRSError as cause:
-        raise wrong("", "correct it; WGS84 UTM 32N is understood, too") from cause
+        raise wrong("", "correct it; WGS 84 / UTM zone 32N is understood, too") from cause
     if crs.is_compound:
         todo = "give its horizontal part alone: heights stay as they are stated"
         raise wrong(", which has heights above a geoid", todo)
@@ -123,7 +133,11 @@ def read_reference_system(
         raise wrong(f", which is {crs.type_name.lower()}", "convert to a projected one")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns of what is refused below
-        group = TransformerGroup(crs, "EPSG:4326", always_xy=True)
+        try:
+            group = TransformerGroup(crs, "EPSG:4326", always_xy=True)
+        except IndexError as cause:  # pyproj wants to name a grid, and there is none
+            found = ", which PROJ does not convert to WGS 84 exactly"
+            raise wrong(found, "convert to a system on WGS 84") from cause
     if not group.best_available:
         grids = (g.short_name for op in group.unavailable_operations[:1] for g in op.grids)
         raise wrong(
@@ -131,22 +145,31 @@ def read_reference_system(
             "install it (pyproj sync), or convert to a system on WGS 84",
         )
     unit = float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected else 1.0
-    return ReferenceSystem(text, bool(crs.is_projected), unit)
+    axes = tuple(str(axis.direction) for axis in crs.axis_info[:2])
+    return ReferenceSystem(text, bool(crs.is_projected), unit, axes)
 
 
 def read_projected(place: str, text: str, *, metres: bool = False) -> ReferenceSystem:
     """Parse the reference system of an output, which must be projected, and in metres if asked.
 
+    Its axes must point east and north: what is written is called so, and cameras are turned by it.
+
     Raises:
         ConfigError: If it is not, or as `read_reference_system`.
     """
     system = read_reference_system(place, text, error=ConfigError)
+    found = None
     if not system.is_projected or (metres and system.unit != 1):
+        found = f"one in {'feet' if system.is_projected else 'degrees'}"
+    elif not system.is_east_north:
+        found = f"one whose axes point {' and '.join(system.axes)}"
+    if found is not None:
         raise ConfigError(
             place,
-            expected=f"a projected reference system{' in metres' * metres}, such as EPSG:32632",
-            found=f"one in {'feet' if system.is_projected else 'degrees'} ({text})",
-            todo="choose the UTM zone of the place, for example",
+            expected=f"a projected reference system{' in metres' * metres}, with axes east and "
+            "north, such as EPSG:32632",
+            found=f"{found} ({text})",
+            todo="choose the UTM zone of the place (--crs), for example",
         )
     return system
 

@@ -2,9 +2,16 @@
 
 import numpy as np
 import pytest
+from pyproj import CRS, Transformer
 
-from chronoscene.errors import SceneError
-from chronoscene.geodesy import Georeference, from_crs, median_longitude, read_reference_system
+from chronoscene.errors import ConfigError, SceneError
+from chronoscene.geodesy import (
+    Georeference,
+    from_crs,
+    median_longitude,
+    read_projected,
+    read_reference_system,
+)
 
 PLACE = (51.5, 10.25)
 SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563
@@ -70,12 +77,35 @@ def test_median_longitude_across_the_antimeridian() -> None:
         ("EPSG:32632+5773", "heights above a geoid"),
         ("EPSG:4978", "geocentric"),
         ("EPSG:27700", "grid"),
+        ("EPSG:3053", "does not convert to WGS 84 exactly"),
     ],
 )
 def test_systems_that_would_be_converted_wrongly_are_refused(text: str, found: str) -> None:
     with pytest.raises(SceneError, match=found) as caught:
         read_reference_system("points.csv:1", text)
     assert caught.value.place == "points.csv:1"
+
+
+def test_another_datum_at_a_great_height() -> None:
+    """Heights stay, but a place on two ellipsoids depends on how far it is above them."""
+    frame = Georeference(46.0, 7.75, 3000.0, "as stated")
+    swiss = read_reference_system("", "EPSG:2056")
+    enu = np.array([[0.0, 0.0, 0.0], [500.0, -300.0, 200.0]])
+    found = swiss.from_local(frame, enu)
+    latitude, longitude, height = frame.to_geodetic(enu).T
+    solid = Transformer.from_crs("EPSG:4979", CRS("EPSG:2056").to_3d(), always_xy=True)
+    expected = np.column_stack(solid.transform(longitude, latitude, height))
+    np.testing.assert_allclose(found[:, :2], expected[:, :2], atol=1e-6)  # was 7 cm away
+    np.testing.assert_allclose(found[:, 2], height, atol=1e-9)
+    # Stated heights do not say above which of the two, which are 50 m apart.
+    np.testing.assert_allclose(swiss.to_local(frame, found), enu, atol=2e-3)
+
+
+def test_names_of_systems() -> None:
+    named = "WGS 84 / UTM zone 32N"
+    with pytest.raises(SceneError, match=f"correct it; {named} is understood, too"):
+        read_reference_system("--crs", "WGS84 UTM 32N")
+    assert read_reference_system("--crs", named).is_projected
 
 
 def test_coordinates_in_feet_have_heights_in_feet() -> None:
@@ -88,6 +118,21 @@ def test_coordinates_in_feet_have_heights_in_feet() -> None:
         foot * feet.from_local(frame, enu), metres.from_local(frame, enu), rtol=1e-9
     )
     np.testing.assert_allclose(feet.to_local(frame, feet.from_local(frame, enu)), enu, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "axes"), [("EPSG:2053", "west and south"), ("EPSG:5513", "south and west")]
+)
+def test_axes_that_are_not_east_and_north_are_read_but_not_written(text: str, axes: str) -> None:
+    """Of South Africa and of Czechia: the second is even left-handed."""
+    assert not read_reference_system("", text).is_east_north
+    with pytest.raises(ConfigError, match=f"one whose axes point {axes} .{text}"):
+        read_projected("--crs", text)
+
+
+@pytest.mark.parametrize("text", ["EPSG:32632", "EPSG:2193", "EPSG:3413", "EPSG:3031"])
+def test_axes_that_are_east_and_north_or_run_along_meridians(text: str) -> None:
+    assert read_projected("--crs", text).is_east_north
 
 
 def test_projected_coordinates_and_back() -> None:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+MAX_STEPS = 2_000_000_000  # Coordinates are integers of 32 bits
+
 
 def write_laz(
     path: Path,
@@ -27,13 +29,17 @@ def write_laz(
         xyz: Coordinates. [N, 3]
         rgb: Colours. [N, 3]
         crs: Their reference system, as PROJ reads it.
-        step: Distance of two coordinates of the file.
+        step: Distance of two coordinates of the file; ten times that, or more, where points lie so
+            far apart that the file could not number them.
         dimensions: Further numbers of the points by their names. [N] each
     """
     import laspy
     from pyproj import CRS
 
     more = dimensions or {}
+    reach = float(np.ptp(xyz, axis=0).max()) if len(xyz) else 0.0
+    while reach > MAX_STEPS * step:
+        step *= 10
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales = np.full(3, step)
     header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)

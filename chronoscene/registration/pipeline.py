@@ -75,7 +75,7 @@ def run(
     if options.tie_points is not None:
         points = read_tie_points(options.tie_points, scale=options.tie_scale, crs=crs)
         if crs is None and points.crs is not None and points.crs.is_projected:
-            crs = points.crs
+            crs = read_projected(str(options.tie_points), points.crs.text)
     with work_folder(work) as lock:
         context = Context(work, Stages(work), options, report, lock)
         inputs = gather(captures, into, context)

@@ -48,9 +48,9 @@ class PointCloud:
         """Keep one point of each cube of this edge."""
         if not len(self):
             return self
-        cubes = np.floor(self.xyz / spacing).astype(np.int64)
-        cubes -= cubes.min(axis=0)
-        numbers = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
+        # Ranks instead of cubes: one point far away makes more cubes than can be numbered.
+        ranks = [np.unique(c, return_inverse=True)[1] for c in np.floor(self.xyz / spacing).T]
+        numbers = np.ravel_multi_index(ranks, [rank.max() + 1 for rank in ranks])
         return self.select(np.sort(np.unique(numbers, return_index=True)[1]))
 
 

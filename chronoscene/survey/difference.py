@@ -70,7 +70,7 @@ class Volumes:
     area_m2: float
     """Area of the cells that both periods know."""
     known_share: float
-    """Share that this is of the cells of the polygon that are on the map."""
+    """Share that this is of the polygon, of which a part may lie off the map."""
     fill_m3: float
     """Volume of the cells that have risen significantly."""
     fill_interval_m3: float
@@ -99,15 +99,26 @@ def subtract(
     return Difference(periods, values, variance, stable, registration)
 
 
-def measure_volumes(difference: Difference, grid: Grid, polygon: str, inside: Mask) -> Volumes:
-    """Measure the volumes of the cells [H, W] of a polygon."""
+def measure_volumes(
+    difference: Difference, grid: Grid, polygon: str, inside: Mask, on_map: float = 1.0
+) -> Volumes:
+    """Measure the volumes of a polygon.
+
+    Args:
+        difference: Between two periods.
+        grid: Its cells.
+        polygon: Name of the polygon.
+        inside: Its cells. [H, W]
+        on_map: Share of the polygon that is on the map.
+    """
     known = inside & np.isfinite(difference.values)
     changed, rises = known & difference.significant, difference.values > 0
     fill, cut, net = (
         _volume(difference, grid.resolution**2, cells)
         for cells in (changed & rises, changed & ~rises, known)
     )
-    area, share = float(known.sum() * grid.resolution**2), float(known.sum() / inside.sum())
+    area = float(known.sum() * grid.resolution**2)
+    share = on_map * float(known.sum() / inside.sum())
     return Volumes(polygon, area, share, *fill, abs(cut[0]), cut[1], *net)
 
 

@@ -125,10 +125,10 @@ def _conversion(
     scene: Scene, world_crs: str, crs: str | None
 ) -> tuple[str, Callable[[Array], Array]]:
     """Name of the reference system of the map, and the transform of world coordinates to it."""
-    local = from_crs(world_crs)
+    local, shift = from_crs(world_crs), np.asarray(scene.world.offset)
     if local is not None:
         target = read_projected("--crs", crs or _utm(local.latitude, local.longitude), metres=True)
-        return target.text, lambda xyz: target.from_local(local, xyz)
+        return target.text, lambda xyz: target.from_local(local, xyz + shift)
     import pyproj
 
     source = read_projected(str(scene.root), world_crs, metres=True)
@@ -136,7 +136,7 @@ def _conversion(
     transform = pyproj.Transformer.from_crs(source.text, target.text, always_xy=True).transform
 
     def convert(xyz: Array) -> Array:
-        east, north, height = (xyz + np.asarray(scene.world.offset)).T
+        east, north, height = (xyz + shift).T
         return np.column_stack([*transform(east, north), height])
 
     return target.text, convert

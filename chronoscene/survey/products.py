@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.arrays import Array, Mask
+from chronoscene.arrays import Array
 from chronoscene.checks import import_extra
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import safe_part
@@ -30,7 +30,7 @@ from chronoscene.survey.distances import measure_distances
 from chronoscene.survey.figure import draw_difference
 from chronoscene.survey.grid import Grid, choose_grid, natural_resolution
 from chronoscene.survey.map_frame import MapFrame, map_frame
-from chronoscene.survey.rasters import WHOLE, read_polygons, write_raster
+from chronoscene.survey.rasters import WHOLE, Polygon, read_polygons, write_raster
 from chronoscene.survey.surface import Surface, map_surface
 from chronoscene.survey.uncertainty import UNKNOWN, certified_registration
 from chronoscene.survey.views import depth_views
@@ -97,7 +97,7 @@ class Survey:
 
     def compare_surfaces(
         self, pair: tuple[int, int], grid: Grid, surfaces: Mapping[int, Surface],
-        polygons: Mapping[str, Mask],
+        polygons: Mapping[str, Polygon],
     ) -> dict[str, Any]:  # fmt: skip
         """Write difference and picture of two periods; return their summary with the volumes."""
         found = subtract(self.scene, grid, surfaces, pair)
@@ -118,7 +118,8 @@ class Survey:
             "level_of_detection": _median(found.level),
             "changed_share": float(found.significant.sum() / max(known.sum(), 1)),
             "volumes": [
-                asdict(measure_volumes(found, grid, *polygon)) for polygon in polygons.items()
+                asdict(measure_volumes(found, grid, name, *polygon))
+                for name, polygon in polygons.items()
             ],
         }
 
@@ -224,7 +225,7 @@ def survey_run(
     work = Survey(folder, scene, map_frame(scene, options.crs))
     resolution = options.resolution or natural_resolution(scene, run.record.max_width)
     grid = choose_grid(scene, work.frame, resolution)
-    polygons = {WHOLE: np.ones(grid.shape, bool)}
+    polygons = {WHOLE: Polygon(np.ones(grid.shape, bool), 1.0)}
     polygons |= read_polygons(options.area, grid, work.frame) if options.area else {}
     surfaces: dict[int, Surface] = {}
     clouds: dict[int, PointCloud] = {}

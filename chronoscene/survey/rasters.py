@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,15 @@ from chronoscene.survey.map_frame import MapFrame
 
 NODATA = -9999.0
 WHOLE = "whole area"  # Name of the volumes of the whole map
+
+
+class Polygon(NamedTuple):
+    """A polygon, as far as it is on the map."""
+
+    cells: Mask
+    """Mask of the cells whose centres are inside. [H, W]"""
+    on_map: float
+    """Share of its area that is on the map."""
 
 
 def write_raster(
@@ -55,8 +64,8 @@ def _transform(grid: Grid) -> Any:
     return Affine(grid.resolution, 0, grid.left, 0, -grid.resolution, grid.top)
 
 
-def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Mask]:
-    """Read the polygons of a GeoJSON file as the cells [H, W] whose centres are inside.
+def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Polygon]:
+    """Read the polygons of a GeoJSON file by name.
 
     Coordinates are in the system of its member ``crs`` if it has one; else longitude and latitude
     if they can be, and map coordinates otherwise. Names are the property ``name``, or numbers; one
@@ -69,7 +78,7 @@ def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Mask]:
 
     data = read_json_document(path, error=ConfigError)
     features = data.get("features", [data])
-    named: dict[str, Mask] = {}
+    named: dict[str, Polygon] = {}
     for number, feature in enumerate(features if isinstance(features, list) else (), 1):
         place = f"--area {path}, feature {number}"
         shape = _on_map(place, data.get("crs"), feature, frame)
@@ -79,10 +88,33 @@ def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Mask]:
         properties = feature.get("properties")
         given = properties.get("name") if isinstance(properties, dict) else None
         name = str(number if given is None else given)
-        named[f"{name} ({number})" if name in (WHOLE, *named) else name] = cells
+        polygon = Polygon(cells, _share_on_map(shape, cells, grid))
+        named[f"{name} ({number})" if name in (WHOLE, *named) else name] = polygon
     if not named:
         raise _wrong(f"--area {path}", "polygons", "none", "draw at least one")
     return named
+
+
+def _share_on_map(shape: Any, cells: Mask, grid: Grid) -> float:
+    """Share of the area of a geometry in map coordinates that its cells cover; 1 if it is inside
+    the map."""
+    from rasterio.features import bounds
+    from rasterio.transform import array_bounds
+
+    west, south, east, north = array_bounds(*grid.shape, _transform(grid))
+    left, bottom, right, top = bounds(shape)
+    if west <= left and south <= bottom and right <= east and top <= north:
+        return 1.0
+    rings = shape["coordinates"] if shape["type"] == "MultiPolygon" else [shape["coordinates"]]
+    area = sum(_area(outer) - sum(map(_area, holes)) for outer, *holes in rings)
+    return min(1.0, float(cells.sum()) * grid.resolution**2 / max(area, grid.resolution**2))
+
+
+def _area(ring: Any) -> float:
+    """Area inside a closed ring, by the trapezoids under its edges."""
+    x, y = np.array([corner[:2] for corner in ring], np.float64).T
+    x, y = x - x[0], y - y[0]
+    return abs(float(np.sum((x[1:] - x[:-1]) * (y[1:] + y[:-1])))) / 2
 
 
 def _on_map(place: str, system: Any, feature: Any, frame: MapFrame) -> Any:

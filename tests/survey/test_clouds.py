@@ -47,6 +47,17 @@ def test_sparse_points_of_a_period(scene):
     assert len(sparse_cloud(scene, 0, frame, alone=True)) == len(both[0])
 
 
+def test_one_point_in_each_cube_however_far_one_lies_away():
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(0, 1, (400, 3))
+    xyz[7], xyz[9] = [1e8, -1e8, 1e8], [1e8, -1e8, 1e8]
+    cloud = PointCloud(xyz, np.zeros((400, 3), np.uint8), xyz, np.arange(400.0))
+    made = cloud.thinned(0.25)
+    _, first = np.unique(np.floor(xyz / 0.25), axis=0, return_index=True)
+    np.testing.assert_array_equal(made.spread, np.sort(first))
+    assert 7 in made.spread and 9 not in made.spread
+
+
 def plane(normal, shift, seed):
     """A patch of 12 x 12 m, a quarter of which is shifted, seen from where the normal points."""
     rng = np.random.default_rng(seed)

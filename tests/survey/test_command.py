@@ -108,6 +108,8 @@ def test_a_scene_without_a_model_has_points_alone(tmp_path):
         value = "1" if option == "--resolution" else scene / "sparse/world.json"
         again = survey(scene, "--out", tmp_path / "again", option, value)
         assert f"{option}: expected a finished run" in str(again.exception)
+    again = survey(site, "--out", tmp_path / "again", "--device", "cpu")
+    assert "--device: expected none for a scene without a model" in str(again.exception)
 
 
 def test_distances_between_dense_sparse_points(tmp_path):

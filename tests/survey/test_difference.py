@@ -86,6 +86,7 @@ def test_level_of_detection_and_volumes(scene):
     assert volumes.cut_m3 == pytest.approx(40 * 0.25 * 2, rel=0.5)
     assert abs(volumes.net_m3 - 130) < volumes.net_interval_m3 < 30
     assert volumes.area_m2 == 70 * 80 * 0.25 and volumes.known_share == 70 / 80
+    assert measure_volumes(found, GRID, "cut", WHOLE, 0.5).known_share == 0.5 * 70 / 80
     inside = np.zeros(GRID.shape, bool)
     inside[10:20, 10:30] = True
     box = measure_volumes(found, GRID, "box", inside)

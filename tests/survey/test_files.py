@@ -71,6 +71,17 @@ def test_a_cloud_without_points(tmp_path):
     assert len(laspy.read(tmp_path / "a.laz")) == 0
 
 
+GRID_CORNER = np.array([680_000.0, 5_151_985.0])  # In the south-west
+
+
+def test_a_cloud_with_a_point_far_away(tmp_path):
+    xyz = np.array([[0.0, 0, 0], [0.12, 4.56, -7.89], [3e7, -4e7, 2e7]])
+    write_laz(tmp_path / "a.laz", xyz, np.zeros((3, 3), np.uint8), HERE.crs)
+    read = laspy.read(tmp_path / "a.laz")
+    np.testing.assert_allclose(read.header.scales, 0.1)
+    np.testing.assert_allclose(read.xyz, xyz, atol=0.051)
+
+
 SQUARE = np.array([[2, 2], [7, 2], [7, 5], [2, 5], [2, 2]]) + np.array([680_000.0, 5_151_990.0])
 
 
@@ -101,10 +112,29 @@ def test_polygons_in_each_system(tmp_path):
     ):
         made = read(tmp_path, data)
         assert list(made) == ["pit"]
-        np.testing.assert_array_equal(made["pit"], cells)
+        np.testing.assert_array_equal(made["pit"].cells, cells)
+        assert made["pit"].on_map == 1
     near = Grid(0.0, 10.0, 0.5, 40, 30, 0.0, 10.0)
     local = read(tmp_path, geojson(SQUARE - [680_000, 5_151_990])["features"][0], HERE, near)
-    np.testing.assert_array_equal(local["1"], cells)
+    np.testing.assert_array_equal(local["1"].cells, cells)
+
+
+def test_a_polygon_that_leaves_the_map(tmp_path):
+    # The map is 20 m wide: 5 of 40 m, less half of the hole, are on it.
+    outer, hole = (
+        np.array([[15, y], [55, y], [55, y + h], [15, y + h], [15, y]]) + GRID_CORNER
+        for y, h in ((2, 8), (4, 2))
+    )
+    hole[:, 0] = np.array([17, 23, 23, 17, 17]) + GRID_CORNER[0]
+    data = geojson(outer)
+    data["features"][0]["geometry"]["coordinates"].append(hole.tolist())
+    made = read(tmp_path, data)["1"]
+    assert made.cells.sum() * 0.25 == 5 * 8 - 3 * 2
+    assert made.on_map == pytest.approx((5 * 8 - 3 * 2) / (40 * 8 - 6 * 2))
+    several = data["features"][0]["geometry"]
+    several |= {"type": "MultiPolygon", "coordinates": [several["coordinates"], [SQUARE.tolist()]]}
+    both = read(tmp_path, data)["1"]
+    assert both.on_map == pytest.approx((5 * 8 - 3 * 2 + 15) / (40 * 8 - 6 * 2 + 15))
 
 
 def test_equal_names_stay_apart(tmp_path):

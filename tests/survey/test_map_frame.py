@@ -53,6 +53,13 @@ def test_a_projected_scene_with_an_offset(scene):
     np.testing.assert_allclose(other.to_map(XYZ), wanted, atol=0.01)
 
 
+def test_the_local_frame_with_an_offset(scene):
+    shift = np.array([900.0, -700.0, 40.0])
+    world = moved(scene, -shift, crs=PLACE.crs, offset=tuple(shift))
+    frame = map_frame(world, None)
+    np.testing.assert_allclose(frame.to_map(XYZ - shift), exactly(XYZ, frame.crs), atol=0.003)
+
+
 def test_the_error_is_that_of_the_affine_map(scene):
     wide = moved(scene, [3000.0, 0, 0], crs=PLACE.crs)
     frames = [f if f.period else g for f, g in zip(wide.frames, scene.frames, strict=True)]
@@ -78,6 +85,7 @@ def test_local_metres(scene):
         (WorldFrame("metre", PLACE.crs), "EPSG:4326", ConfigError, "found one in degrees"),
         (WorldFrame("metre", PLACE.crs), "EPSG:6424", ConfigError, "found one in feet"),
         (WorldFrame("metre", PLACE.crs), "EPSG:99999", ConfigError, "that PROJ knows"),
+        (WorldFrame("metre", PLACE.crs), "EPSG:5513", ConfigError, "axes point south and west"),
         (WorldFrame("metre", PLACE.crs), "EPSG:32755", ConfigError, "metres are metres"),
         (WorldFrame("metre", PLACE.crs), "EPSG:3857", ConfigError, r"found scale 1\.45"),
         (WorldFrame("metre", "EPSG:4326"), None, ConfigError, "found one in degrees"),

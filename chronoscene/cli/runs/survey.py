@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE
+from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE, refuse_options
 from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
 from chronoscene.cli.progress import announce, progress_bar
 from chronoscene.cli.runs.changes import BETWEEN, parse_pairs
@@ -61,6 +61,8 @@ def command(
     check_packages()
     check_place("--out", out)
     is_run = scene is not None or (source / RUN_FILE).is_file()
+    if not is_run:
+        refuse_options(("device", "plugin"), "for a scene without a model")
     run = open_run(source, device=device, plugin=plugin) if is_run else None
     announce("read the scene")
     found = read_and_note(source, None, None) if run is None else run.scene(scene)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE
+from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, refuse_options
 from chronoscene.cli.output import check_file, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
@@ -67,7 +67,9 @@ def command(
     check_file("PAGE", page)
     system = None if crs is None else read_reference_system("--crs", crs, error=ConfigError)
     points = None
-    if tie_points is not None:
+    if tie_points is None:
+        refuse_options(("tie_scale", "crs"), "without --tie-points")
+    else:
         points = read_tie_points(tie_points, scale=tie_scale, crs=system)
     with progress_bar(f"read {captures}") as report:
         found = read_captures(folder, table=table).images

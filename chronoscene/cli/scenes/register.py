@@ -7,10 +7,9 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE
+from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, refuse_options
 from chronoscene.cli.output import check_place, emit, say
 from chronoscene.cli.progress import progress_bar
-from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
@@ -181,22 +180,19 @@ def command(
 
 
 def _check_together(options: Options, scene: Path | None) -> None:
-    """Refuse options that others would make ineffective.
+    """Refuse options that others, or their absence, make ineffective.
 
     Raises:
         ConfigError: If there are such options.
     """
-    for option, given, other, rules_out in (
-        ("--route", options.route is not None, "--into", scene is not None),
-        ("--calibration", options.calibration != "auto", "--cameras", options.cameras is not None),
+    for names, applies, condition in (
+        (("route", "calibration"), scene is not None, "with --into"),
+        (("calibration",), options.cameras is not None, "with --cameras"),
+        (("max_image_size", "max_features"), options.features is not None, "with --features"),
+        (("tie_scale",), options.tie_points is None, "without --tie-points"),
     ):
-        if given and rules_out:
-            raise ConfigError(
-                option,
-                expected=f"no {option} with {other}, where it has no effect",
-                found="both",
-                todo="omit one of them",
-            )
+        if applies:
+            refuse_options(names, condition)
 
 
 def summary(registered: Registered, out: Path, crs: str | None) -> str:

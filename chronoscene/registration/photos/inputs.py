@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from chronoscene.errors import RegistrationError, SceneError
-from chronoscene.geodesy import Georeference, from_crs
+from chronoscene.geodesy import Georeference
 from chronoscene.images.decoding import image_size, load_photo
 from chronoscene.images.exif import set_upright
 from chronoscene.images.masks import MASKS, mask_place
@@ -29,6 +29,7 @@ from chronoscene.registration.photos.captures import Captures, period_date
 from chronoscene.registration.photos.gps_priors import Positions, locate
 from chronoscene.registration.photos.photo import Capture
 from chronoscene.registration.photos.stated import stated
+from chronoscene.registration.report.coordinates import local_frame
 from chronoscene.registration.result import ANOTHER_PLACE
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
@@ -152,8 +153,8 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> PhotoIn
     ]
     if scene is not None:
         inputs += [
-            [f.name, str(scene.image_path(f)), *_mask_inputs(scene.masks.get(f.name))]
-            for f in scene.frames
+            [f.name, str(path), sha256_of(path), *_mask_inputs(scene.masks.get(f.name))]
+            for f, path in ((f, scene.image_path(f)) for f in scene.frames)
         ]
     names = stages.run("photos", inputs, lambda: _place(source, scene, notes, context))
     images = renamed(source, names)
@@ -248,7 +249,7 @@ def _locate(
     images: Sequence[Capture], scene: Scene | None, context: Context
 ) -> tuple[Positions, Georeference | None]:
     """Locate photos in the frame of the scene if it is georeferenced, else in their own."""
-    frame = from_crs(scene.world.crs) if scene and scene.world.unit == "metre" else None
+    frame = None if scene is None else local_frame(scene)
     positions = locate(images, frame)
     context.stages.remark("positions", *positions.remarks)
     return positions, positions.georeference if scene is None else frame

@@ -198,6 +198,8 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if found is None and control is None and gps is None and not objections:
         level = "not checked"
     text = _words(level, objections, found, left_out, ties) + precision(model)
+    if level == "not checked" and model.georeference is not None:
+        text = "The model lies where the scene that it extends does; nothing else measures that."
     return Position(
         level,
         text,
@@ -247,11 +249,15 @@ def _gps_errors(model: Registered) -> tuple[list[str], Array]:
 
 
 def _scale_error(model: Registered, gps: Rmse) -> float:
-    """Relative standard deviation of the scale, from the horizontal residuals of all positions."""
+    """Relative standard deviation of the scale, from the horizontal residuals of all positions.
+
+    Their variance is that of one coordinate: four unknowns were fitted to two of each position.
+    """
     use = model.gps_used & np.isfinite(model.gps_enu).all(axis=1)
     flat = model.gps_enu[use][:, :2]
     spread = float(np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum()))
-    return gps.horizontal / max(spread, 1e-9)
+    deviation = gps.horizontal * np.sqrt(gps.count / max(2 * gps.count - 4, 1))
+    return float(deviation / max(spread, 1e-9))
 
 
 def _errors(place: str, rmse: Rmse | None, pixel: float | None) -> Iterator[Objection]:

@@ -10,17 +10,18 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from chronoscene.arrays import Array
-from chronoscene.geodesy import Georeference, ReferenceSystem
+from chronoscene.geodesy import Georeference, HeightKind, ReferenceSystem, from_crs
+from chronoscene.io.documents import read_json_document
 from chronoscene.io.laz import write_laz
 from chronoscene.io.staging import replacing, write_text_atomic
 from chronoscene.registration.result import Registered
@@ -67,6 +68,22 @@ def placed_model(model: Registered) -> Placed:
     return Placed(model.names, labels, model.cam_from_world, model.points, model.colors)
 
 
+def local_frame(scene: Scene) -> Georeference | None:
+    """Read the local frame of a scene that was registered, with its kind of heights.
+
+    None for a world in another frame, or with an offset from this one.
+
+    Raises:
+        SceneError: If its ``georeference.json`` is damaged.
+    """
+    world, path = scene.world, scene.root / GEOREFERENCE
+    frame = from_crs(world.crs) if world.unit == "metre" and not any(world.offset) else None
+    if frame is None or not path.is_file():
+        return frame
+    kind = read_json_document(path).get("height_kind")
+    return replace(frame, height_kind=kind) if kind in get_args(HeightKind) else frame
+
+
 def write_coordinates(
     folder: Path, model: Placed, frame: Georeference | None, output: ReferenceSystem | None
 ) -> None:
@@ -106,7 +123,7 @@ def _linear(model: Placed, frame: Georeference, output: ReferenceSystem) -> dict
         "crs": output.text,
         "offset": offset.tolist(),
         "matrix": matrix.tolist(),
-        "largest_error": float(np.linalg.norm(error, axis=1).max()),
+        "largest_error": output.unit * float(np.linalg.norm(error, axis=1).max()),
     }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
-from chronoscene.geodesy import Georeference, ReferenceSystem
+from chronoscene.geodesy import Georeference, ReferenceSystem, median_longitude
 from chronoscene.registration.quality.rays import model_rays, place
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.control import (
@@ -104,8 +104,11 @@ def align_with_tie_points(
     there, used, more = model, set(adjusted or ()), list[str]()
     if adjusted is None:
         there, used, more = _to_control(model, clicks, control, tie_points)
-    if used and model.georeference is None and tie_points.crs is not None:
-        there = replace(there, georeference=frame, gps_enu=np.full_like(model.gps_enu, np.nan))
+    if used and frame is not None and tie_points.crs is not None:
+        # Heights are those of the control from here on, whatever the photos state.
+        there = replace(there, georeference=replace(frame, height_kind="as stated"))
+        if model.georeference is None:
+            there = replace(there, gps_enu=np.full_like(model.gps_enu, np.nan))
     if not used and model.georeference is None:
         known = {}  # the place of the model is unknown
 
@@ -261,10 +264,10 @@ def control_frame(points: TiePoints) -> Georeference | None:
     anywhere = Georeference(latitude=0.0, longitude=0.0, height=0.0, height_kind="as stated")
     known = points.located(anywhere)
     places = anywhere.to_geodetic(np.stack([known[name] for name in sorted(control)]))
-    latitude, longitude, height = np.median(places, axis=0).tolist()
+    latitude, _, height = np.median(places, axis=0).tolist()
     return Georeference(
         latitude=round(latitude, 7),
-        longitude=round(longitude, 7),
+        longitude=round(median_longitude(places[:, 1]), 7),
         height=round(height, 2),
         height_kind="as stated",
     )

@@ -37,7 +37,8 @@ COLUMNS = {
     "sigma y": ("sy", "sigma_y", "accuracy_y"),
     "sigma z": ("sz", "sigma_z", "accuracy_z"),
 }
-"""Names of columns, in lower case; upper-case X, Y, Z are world coordinates."""
+"""Names of columns, in lower case; upper-case X, Y, Z are world coordinates, unless no other
+column can be the pixels."""
 
 _TODO_CSV = "write lines such as: corner1,2016/IMG_0001.jpg,812.5,334.0"
 _TODO_ODM = "write lines such as: 544256.7 5320919.9 5.0 3044.5 2622.0 IMG_0525.jpg gcp01"
@@ -143,7 +144,7 @@ def read_tie_points(
         named = (
             (n, found[1].strip())
             for n, line in filled
-            if (found := re.fullmatch(r"#\s*crs\s*[:=]\s*(.+)", line, re.IGNORECASE))
+            if (found := re.fullmatch(r"#\s*crs(?:\s*[:=]|\s)\s*(.+)", line, re.IGNORECASE))
         )
         crs = next((read_reference_system(f"{path}:{n}", text) for n, text in named), crs)
         rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")])
@@ -228,10 +229,15 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
     cells = [(n, [c.strip() for c in next(csv.reader([line]))]) for n, line in lines]
     order = _header(path, *cells[0]) if cells else None
     if order is None:
-        order = {name: i for i, name in enumerate(COLUMNS)}
+        order, width = {name: i for i, name in enumerate(COLUMNS)}, len(COLUMNS)
     else:
-        cells = cells[1:]
+        width, cells = len(cells[0][1]), cells[1:]
     for number, row in cells:
+        if any(row[width:]):
+            raise _wrong(
+                path, number, f"{width} fields", f"{len(row)}",
+                "write decimal points instead of commas",
+            )  # fmt: skip
         if len(row) <= max(order[name] for name in ("point", "image", "x", "y")):
             found = f"{len(row)} fields"
             raise _wrong(path, number, "point id, image, x, y", found, _TODO_CSV)
@@ -276,14 +282,21 @@ def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | Non
     """Column of each field by name; None if the first line is data."""
     if len(row) > 3 and _is_number(row[2]) and _is_number(row[3]):
         return None
-    order = {}
+    order: dict[str, int] = {}
+    others = {name.lower() for name in row if name not in ("X", "Y", "Z")}
+    has_pixels = not others.isdisjoint((*COLUMNS["x"], *COLUMNS["y"]))
     for i, name in enumerate(row):
-        if name in ("X", "Y", "Z") and any(n in row for n in ("x", "y")):
+        if name in ("X", "Y", "Z") and has_pixels:
             order[f"world {name.lower()}"] = i
             continue
         for key, names in COLUMNS.items():
-            if name.lower() in names:
-                order.setdefault(key, i)
+            if name.lower() not in names:
+                continue
+            if order.setdefault(key, i) != i and key not in ("point", "image"):
+                raise _wrong(
+                    path, number, f"one column of the {key} of a point",
+                    f"{row[order[key]]} and {name}", "rename the one that does not count",
+                )  # fmt: skip
     missing = [key for key in ("point", "image", "x", "y") if key not in order]
     if missing:
         raise _wrong(

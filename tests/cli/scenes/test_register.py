@@ -148,15 +148,42 @@ def test_the_reference_system_is_checked_before_any_work(
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
 
 
+def test_axes_of_control_are_checked_before_any_work(tmp_path: Path) -> None:
+    """What is written in that system is called east and north."""
+    file = tmp_path / "gcp.csv"
+    file.write_text("# crs: EPSG:5513\np,0.jpg,1,2,1040000,730000,300\n")
+    done = call(photos(tmp_path / "in/a", 3).parent, tmp_path / "out", "--tie-points", file)
+    assert isinstance(done.exception, ConfigError), done.output
+    assert done.exception.place == str(file) and "south and west" in done.exception.found
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["gcp.csv", "in"]
+
+
 @pytest.mark.parametrize(
-    ("option", "value", "other"),
-    [("--route", "separate", "--into"), ("--calibration", "per-period", "--cameras")],
+    ("option", "value", "given", "condition"),
+    [
+        ("--route", "separate", "--into", "with --into"),
+        ("--calibration", "shared", "--into", "with --into"),
+        ("--calibration", "per-period", "--cameras", "with --cameras"),
+        ("--max-image-size", "800", "--features", "with --features"),
+        ("--max-features", "900", "--features", "with --features"),
+        ("--tie-scale", "0.5", None, "without --tie-points"),
+    ],
 )
 def test_options_without_an_effect_are_refused(
-    tmp_path: Path, option: str, value: str, other: str
+    tmp_path: Path, option: str, value: str, given: str | None, condition: str
 ) -> None:
     (tmp_path / "given").touch()
-    done = call(
-        photos(tmp_path / "in/a", 3), tmp_path / "out", option, value, other, tmp_path / "given"
-    )
-    assert str(done.exception).startswith(f"{option}: expected no {option} with {other}")
+    other = [] if given is None else [given, tmp_path / "given"]
+    done = call(photos(tmp_path / "in/a", 3), tmp_path / "out", option, value, *other)
+    assert str(done.exception).startswith(f"{option}: expected none {condition}")
+    assert not (tmp_path / "out.work").exists()
+
+
+@pytest.mark.parametrize(("option", "value"), [("--tie-scale", "2"), ("--crs", "EPSG:32632")])
+def test_mark_refuses_options_of_points_that_are_not_given(
+    tmp_path: Path, option: str, value: str
+) -> None:
+    words = ["mark", photos(tmp_path / "in", 2), tmp_path / "page.html", option, value]
+    done = CliRunner().invoke(main, list(map(str, words)))
+    assert str(done.exception).startswith(f"{option}: expected none without --tie-points")
+    assert not (tmp_path / "page.html").exists()

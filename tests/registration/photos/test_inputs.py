@@ -4,16 +4,20 @@ import hashlib
 import io
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene.geodesy import Georeference
 from chronoscene.registration.photos import inputs
 from chronoscene.registration.photos.captures import Captures, read_captures
 from chronoscene.registration.photos.gps_priors import locate
 from chronoscene.registration.photos.photo import Capture, Gps
 from chronoscene.registration.result import ANOTHER_PLACE
+from chronoscene.scene import WorldFrame
 
 
 @pytest.fixture
@@ -142,6 +146,49 @@ def test_a_period_of_another_place_is_said_to_be_one(folder: Path) -> None:
     assert {name.split("/")[0] for name in found} == {"before"}  # it comes second
     assert next(iter(found.values())).startswith("2,217 km")
     assert next(iter(found.values())).endswith(ANOTHER_PLACE)
+
+
+def test_the_first_stage_depends_on_the_images_of_a_scene_that_is_extended(folder: Path) -> None:
+    for name in ("captures/0.jpg", "old/1.jpg"):
+        save(folder / name, len(name))
+    captures = read_captures(folder / "captures")
+    scene: Any = SimpleNamespace(
+        root=folder / "old", frames=(SimpleNamespace(name="1.jpg"),), num_periods=1, masks={},
+        periods=(SimpleNamespace(label="old", date=None),), world=WorldFrame(),
+        image_path=lambda frame: folder / "old" / frame.name,
+    )  # fmt: skip
+    scene.frames[0].period = 0
+    seen: list[Any] = []
+
+    def run(_: str, depends_on: Any, __: object) -> list[str]:
+        seen.append(depends_on)
+        return ["captures/0.jpg"]
+
+    context: Any = SimpleNamespace(stages=SimpleNamespace(run=run, remark=lambda *_: None))
+    inputs.gather(captures, scene, context)
+    inputs.gather(captures, scene, context)
+    assert seen[0] == seen[1]
+    save(folder / "old/1.jpg", 99)
+    inputs.gather(captures, scene, context)
+    assert seen[2] != seen[1]
+
+
+@pytest.mark.parametrize("offset", [0.0, 500.0])
+def test_positions_are_in_the_frame_of_a_scene_unless_it_has_an_offset(
+    folder: Path, offset: float
+) -> None:
+    for i in range(4):
+        save(folder / f"{i}.jpg", i)
+    images = tuple(placed(c, 51.0) for c in read_captures(folder).images)
+    frame = Georeference(51.001, 11.0, 90.0, "as stated")
+    (folder / "georeference.json").write_text('{"height_kind": "relative"}')
+    world = WorldFrame("metre", frame.crs, (offset, 0.0, 0.0))
+    scene: Any = SimpleNamespace(root=folder, world=world)
+    context: Any = SimpleNamespace(stages=SimpleNamespace(remark=lambda *_: None))
+    positions, georeference = inputs._locate(images, scene, context)
+    assert georeference == (None if offset else replace(frame, height_kind="relative"))
+    middle = np.median(positions.enu[:, 1])
+    assert middle == pytest.approx(0.0 if offset else -111.25, abs=0.1)
 
 
 def test_photos_that_are_not_registered_do_not_date_a_period(folder: Path) -> None:

@@ -10,6 +10,7 @@ from chronoscene.registration.photos.stated import Stated
 from chronoscene.registration.quality.position import Position, judge_position
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import fit
 
 FOCAL = 400.0
 
@@ -82,3 +83,23 @@ def test_scale_has_an_accuracy_of_its_own(model: Registered) -> None:
     worse = judge_position(noisy)
     assert worse.scale_error is not None and worse.scale_error > 0.02
     assert "scale" in [o.check for o in worse.objections]
+
+
+@pytest.mark.parametrize("count", [6, 40])
+def test_the_accuracy_of_the_scale_against_monte_carlo(model: Registered, count: int) -> None:
+    rng = np.random.default_rng(3)
+    places = rng.uniform(-30, 30, (count, 3)) * [1, 1, 0.05]
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    names, cameras = tuple(f"{i}.jpg" for i in range(count)), model.cameras[:1] * count
+    bare = replace(model, names=names, cameras=cameras, gps_used=np.ones(count, bool))
+    scales, stated = [], []
+    for _ in range(400):
+        gps = places + rng.normal(0, 1, places.shape)
+        found = fit(places, gps)
+        assert found is not None
+        move = found.to_sim3()
+        poses[:, :3, 3] = -move.apply(places)
+        scales.append(move.scale)
+        position = judge_position(replace(bare, cam_from_world=poses, gps_enu=gps))
+        stated.append(position.scale_error)
+    assert np.mean(stated) == pytest.approx(np.std(scales), rel=0.12)

@@ -157,6 +157,16 @@ def test_check_points_only_measure(tmp_path: Path, made: Generated) -> None:
     assert position.level == "not checked" and not any(r.error for r in ties.residuals)
 
 
+@pytest.mark.parametrize(("count", "kind"), [(8, "as stated"), (2, "relative")])
+def test_heights_are_those_of_the_control_that_a_model_was_moved_to(
+    tmp_path: Path, made: Generated, count: int, kind: str
+) -> None:
+    frame = replace(FRAME, height_kind="relative")
+    file = survey(tmp_path / "s.csv", made, points=count)
+    ties, _ = judged(replace(made.model, georeference=frame), file)
+    assert ties.model.georeference == replace(frame, height_kind=kind)
+
+
 def test_two_control_points_are_check_points(tmp_path: Path, made: Generated) -> None:
     _, position = judged(made.model, survey(tmp_path / "s.csv", made, points=2))
     assert position.check is not None and position.check.count == 2
@@ -170,6 +180,9 @@ def test_gps_and_nothing(made: Generated) -> None:
     assert f"{position.gps.horizontal:.3g} m horizontal" in position.text
     nowhere = judge_position(replace(made.model, georeference=None))
     assert nowhere.level == "not checked" and "no ground control" in nowhere.text
+    unused = np.zeros(len(made.model.names), bool)
+    extended = judge_position(replace(made.model, gps_used=unused, route="frozen"))
+    assert extended.level == "not checked" and "the scene that it extends" in extended.text
 
 
 def test_control_far_from_gps_is_in_another_system(tmp_path: Path, made: Generated) -> None:
@@ -240,6 +253,11 @@ def test_cameras_and_points_come_in_the_reference_system(
     approximate = world @ np.array(linear["matrix"]).T + linear["offset"]
     gap = np.linalg.norm(approximate - expected, axis=1)
     assert 0.01 < gap.max() < linear["largest_error"] + 1e-3
+    # Of UTM in feet the error is the same in metres.
+    feet = read_reference_system("", "+proj=utm +zone=32 +ellps=WGS84 +units=us-ft")
+    write_coordinates(tmp_path, model, ties.model.georeference, feet)
+    again = json.loads((tmp_path / "georeference.json").read_text())["output"]
+    assert again["largest_error"] == pytest.approx(linear["largest_error"], rel=1e-3)
 
 
 def test_a_photo_straight_down_with_its_top_north_has_no_angles() -> None:

@@ -28,6 +28,16 @@ def test_ground_control_gives_a_frame(tmp_path: Path) -> None:
     assert between == pytest.approx(100.0 / 0.9996, abs=0.01)
 
 
+def test_control_on_both_sides_of_the_antimeridian(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    rows = [f"p{i},a.jpg,1,2,{x},-16.8,10" for i, x in enumerate((179.999, -179.999, 179.9996))]
+    path.write_text("\n".join(["# crs: EPSG:4326", "point,image,x,y,X,Y,Z", *rows, ""]))
+    points = read_tie_points(path)
+    frame = control_frame(points)
+    assert frame is not None and frame.longitude == 179.9996
+    assert np.abs(np.stack(list(points.located(frame).values()))).max() < 200.0
+
+
 def test_points_without_a_reference_system_give_none(tmp_path: Path) -> None:
     path = tmp_path / "ties.csv"
     path.write_text("point,image,x,y,X,Y,Z\none,a.jpg,1,2,3,4,5\n")

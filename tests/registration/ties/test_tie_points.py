@@ -113,6 +113,11 @@ def test_odm_list(tmp_path: Path) -> None:
         ("p,a.jpg,1,2\n,b.jpg,1,2\n", 2, "a point id and an image"),
         ("p,a.jpg,1,2\np,a.jpg,5,6\n", 2, "line 1"),
         ("p,a.jpg,1,2,3,4\n", 1, "three world coordinates"),
+        ("point,image,x,y\np,a.jpg,812,5,334,0\n", 2, "expected 4 fields, found 6"),
+        ("p,a.jpg,8,5,3,0,6,5,4,0,5,0\n", 1, "decimal points instead of commas"),
+        ("# CRS EPSG:999999\np,a.jpg,1,2\n", 1, "PROJ"),
+        ("point,image,u,v,x,y,z\np,a.jpg,1,2,3,4,5\n", 1, "found u and x"),
+        ("point,image,x,y,lon,lat,easting\np,a.jpg,1,2,3,4,5\n", 1, "found lon and easting"),
         ("p,a.jpg,1,2,3,4,5\np,b.jpg,1,2,3,4,6\n", 2, "same world coordinates"),
         ("image,x,y\na.jpg,1,2\n", 1, "no point"),
         ("point,image,x,y,X,Y,Z,role\np,a.jpg,1,2,3,4,5,guess\n", 2, "'guess'"),
@@ -146,10 +151,27 @@ def test_a_role_may_stand_before_the_coordinates(tmp_path: Path) -> None:
         assert (point.role, point.world) == ("check", (3.0, 4.0, 5.0))
 
 
+def test_empty_fields_at_the_end_of_a_line_do_not_count(tmp_path: Path) -> None:
+    (point,) = read(tmp_path, "point,image,x,y\np,a.jpg,1,2,,\n").points
+    assert point.clicks[0].y == 2.0
+
+
 def test_usual_names_of_world_coordinates(tmp_path: Path) -> None:
     for names in ("Easting,Northing,Elevation", "lon,lat,height", "east,north,up"):
         (point,) = read(tmp_path, f"point,image,x,y,{names}\np,a.jpg,1,2,3,4,5\n").points
         assert point.world == (3.0, 4.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    "header", ["u,v,X,Y,Z", "im_x,im_y,X,Y,Z", "Col,Row,X,Y,Z", "x,y,X,Y,Z", "U,V,East,North,Up"]
+)
+def test_world_coordinates_beside_every_name_of_pixels(tmp_path: Path, header: str) -> None:
+    names, values = [*header.split(","), "point", "image"], ["1", "2", "3", "4", "5", "p", "a.jpg"]
+    for order in (range(7), (2, 3, 4, 0, 1, 5, 6)):
+        lines = (",".join(row[i] for i in order) for row in (names, values))
+        (point,) = read(tmp_path, "\n".join(lines)).points
+        assert (point.clicks[0].x, point.clicks[0].y, point.world) == (1.0, 2.0, (3.0, 4.0, 5.0))
+    assert read(tmp_path, "Point,Image,X,Y\np,a.jpg,1,2\n").points[0].clicks[0].y == 2.0
 
 
 def test_images_may_have_their_names_of_before_registration(tmp_path: Path) -> None:
