@@ -27,6 +27,11 @@ from leaderboard.verification import score_again
 NOT_ASKED = "its scene was not named by --verify"
 NO_IMAGES = "no predictions beside it"
 NO_METHOD = "its method is not registered"
+NO_ENTRY = (
+    "no entry is of this scene as it is read without options; where bench had --period-by or "
+    "--dataset-format, name the scene that chronoscene convert makes with them"
+)
+"""Notice on a scene that was named in vain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +92,7 @@ def read_board(
                 first, path = path, first
             twice = refused(path, f"an entry of the same runs as {first}")
             board.notices.append(f"left out: {twice}")
-        board.notices += [f"{path}: no entry is of this scene" for path in truths.idle]
+        board.notices += [f"{path}: {NO_ENTRY}" for path in truths.idle]
     board.standings = [standing for _, standing in found.values()]
     return board
 

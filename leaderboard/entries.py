@@ -23,6 +23,7 @@ from chronoscene.harness.files.records import RunRecord, ViewScore
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.report.comparable import KEY
 from chronoscene.harness.report.summary import COSTS
+from chronoscene.harness.score.images import STRATEGY as EXTERNAL
 from chronoscene.harness.score.regions import ALL
 from chronoscene.harness.score.scoring import aggregate
 from chronoscene.io.documents import plain_file
@@ -187,6 +188,8 @@ def _check_texts(record: RunRecord) -> None:
     for name in ("scene", "method", "title", "strategy", "preset"):
         if not _NAME.fullmatch(text := getattr(record, name)) or _WORDS.search(text):
             raise ValueError(f"{name} is no plain name: {text[:60]!r}")
+    if record.strategy == EXTERNAL:
+        raise ValueError("images of another program (score-images): name the runs of bench alone")
     if record.strategy not in STRATEGIES:
         raise ValueError(f"unknown strategy: {record.strategy}")
     if not _VARIANT.fullmatch(record.variant) or _WORDS.search(record.variant):

@@ -115,6 +115,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--role", choices=ROLES)
     parser.add_argument("--photos", type=Path, help="of a scene that cannot be generated")
     given = parser.parse_args(arguments)
+    if given.names and given.role:
+        parser.error("--role chooses among all scenes: leave out either it or the names")
     generated = [n for n, s in known.items() if s.synth and given.role in (None, s.role)]
     failed = 0
     for name in given.names or generated:

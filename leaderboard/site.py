@@ -154,8 +154,8 @@ class _Site:
             row = {"method": method, "label": label, "cells": cells}
             efforts.setdefault(effort, []).append(row)
         for rows in efforts.values():
-            rows.sort(
-                key=lambda row: row_order(kind, row["label"], next(iter(row["cells"].values())))
+            rows.sort(  # by the first scene, of which those that lack it are last
+                key=lambda row: [row_order(kind, row["label"], row["cells"].get(s)) for s in scenes]
             )
         return dict(sorted(efforts.items(), key=lambda item: (len(item[0]), item[0])))
 

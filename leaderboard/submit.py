@@ -22,6 +22,7 @@ from chronoscene.harness.files.records import (
 from chronoscene.harness.score.regions import ALL
 from chronoscene.harness.score.scoring import score_folder
 from chronoscene.io.staging import needing_space, partial_name, write_text_atomic
+from chronoscene.io.wording import shown
 from chronoscene.metrics.registry import make_scorers
 from leaderboard.entries import (
     EntryRun,
@@ -37,6 +38,8 @@ from leaderboard.verification import check_values
 
 def submit(folders: Iterable[Path], to: Path) -> list[Path]:
     """Add runs to the entries of a folder; a run of a seed that is there replaces it.
+
+    An entry of older code remains one until all of its seeds are replaced.
 
     The predictions are scored again, and copied beside the entry: without them nobody could verify
     it. Those of other periods than that of the photo are left out.
@@ -60,11 +63,13 @@ def submit(folders: Iterable[Path], to: Path) -> list[Path]:
         known = entries.get(path) or (read_entry(path) if path.exists() else None)
         by_seed = {r.record.seed: r for r in (*(known.runs if known else ()), run)}
         runs = tuple(by_seed[seed] for seed in sorted(by_seed))
+        sources[predictions_folder(path, run.record.seed)] = folder / PREDICTIONS
+        is_kept = any(predictions_folder(path, seed) not in sources for seed in by_seed)
+        outdated = known is not None and known.outdated and is_kept
         try:
-            entries[path] = MeasuredEntry(outdated=known is not None and known.outdated, runs=runs)
+            entries[path] = MeasuredEntry(outdated=outdated, runs=runs)
         except ValidationError as error:
             raise refused(folder, reason_of(error)) from error
-        sources[predictions_folder(path, run.record.seed)] = folder / PREDICTIONS
     for place, source in sources.items():
         _copy_predictions(source, place)
     for path, entry in entries.items():
@@ -110,6 +115,8 @@ def entry_run(folder: Path) -> EntryRun:
         if row.region == ALL and row.rendered_period == row.camera_period:
             values.setdefault(row.view, {})[row.metric] = row.value
     images = {i.view: i for i in manifest.images if i.rendered_period == i.camera_period}
+    if ignored := sorted(images.keys() - values.keys()):  # by their masks
+        raise refused(folder, f"no values of {shown(ignored)}: an entry has all test views")
     if images.keys() != values.keys():
         raise refused(folder, "other views in its rows than among its predictions")
     try:

@@ -24,7 +24,8 @@ class Measures:
     observations: int
     """Observations of points by images of the period."""
     track_mean: float | None
-    """Images of the period that see a point, mean over the points that any of them sees."""
+    """Observations of a point by images of the period, mean over the points that any of them sees.
+    An image may observe a point twice, which COLMAP counts twice as well."""
     track_median: float | None
     reprojection_error: float | None
     """Mean over the observations of the distance between observation and projection, in pixels of
@@ -79,7 +80,7 @@ def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatis
 
 
 def _measures(views: Ints, residual: Array, baselines: Array, coverage: float | None) -> Measures:
-    """Summarise some frames; ``views``: how many of them see each point."""
+    """Summarise some frames; ``views``: their observations of each point."""
     length = views[views > 0]
     return Measures(
         points_seen=len(length),

@@ -25,7 +25,7 @@ from chronoscene.harness.files.records import ViewScore
 from chronoscene.harness.score.scoring import aggregate, rescore
 from chronoscene.io.staging import sha256_of
 from chronoscene.metrics.registry import make_scorers
-from leaderboard.board import NO_IMAGES, NO_METHOD, read_board
+from leaderboard.board import NO_ENTRY, NO_IMAGES, NO_METHOD, read_board
 from leaderboard.scenes import fixed_scenes
 from leaderboard.submit import submit
 
@@ -433,7 +433,8 @@ def test_a_verified_entry_shows_what_the_board_computes(honest, forger):
 def test_a_scene_without_entries_is_named(honest, forger, make_scene_folder):
     other = make_scene_folder(name="other")
     board = read_board(forger.path.parents[1], [honest / "yard", other])
-    assert board.notices == [f"{other}: no entry is of this scene"]
+    assert board.notices == [f"{other}: {NO_ENTRY}"]
+    assert "no entry is of this scene" in NO_ENTRY and "chronoscene convert" in NO_ENTRY
 
 
 def test_forged_truth_helps_nobody(honest, tmp_path):

@@ -75,6 +75,13 @@ def test_scenes_are_made_again_checked_and_told_apart(table, tmp_path, capsys):
     assert main([folder, "--role", "ranking"]) == 0  # which has no generated scene
 
 
+def test_a_role_is_no_choice_among_names(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main([str(tmp_path / "new"), "demo", "--role", "ranking"])
+    assert "leave out either it or the names" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.slow
 def test_a_ranking_scene_is_the_one_of_the_table(tmp_path):
     make(tmp_path / "ranking-street", TABLE["ranking-street"])

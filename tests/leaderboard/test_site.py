@@ -104,6 +104,16 @@ def test_every_link_leads_somewhere_inside(site):
             assert (page.parent / link).resolve().is_relative_to(site)
 
 
+def test_methods_are_sorted_by_one_scene_on_the_first_page(make_run, enter, tmp_path):
+    easy = ((30.0, 30.0, 30.0), (30.0, 30.0, 30.0))
+    better = ((40.0, 40.0, 40.0), (40.0, 40.0, 40.0))
+    runs = [make_run(scene="alley"), make_run(psnr=better), make_run("chronogs", psnr=easy)]
+    enter(runs, tmp_path / "e")
+    write_site(standings(tmp_path / "e"), load_published(), tmp_path / "site")
+    rows = [row for row in Page(tmp_path / "site/index.html").rows if "(joint" in row]
+    assert ["23.00" in rows[0], "40.00" in rows[0], "30.00" in rows[1]] == [True] * 3
+
+
 def test_claimed_results_stand_below_and_are_not_ranked(make_run, enter, tmp_path):
     better = ((38.0, 39.0, 40.0), (31.0, 32.0, 33.0))
     enter([make_run("4dgs"), make_run("chronogs"), make_run(psnr=better)], tmp_path / "e")

@@ -24,6 +24,16 @@ def test_seeds_extend_an_entry_and_replace_themselves(make_run, enter, tmp_path)
     assert found == [(0, 31.0), (1, 21.0)]
 
 
+def test_an_entry_is_of_older_code_until_all_of_its_seeds_are_replaced(make_run, enter, tmp_path):
+    runs, to = [make_run(seed=0), make_run(seed=1)], tmp_path / "entries"
+    (path,) = enter(runs, to)
+    path.write_text(path.read_text().replace('"outdated": false', '"outdated": true'))
+    enter(runs[:1], to)
+    assert read_entry(path).outdated
+    enter(runs, to)
+    assert not read_entry(path).outdated
+
+
 def test_a_folder_of_runs_gives_an_entry_per_setting(make_run, enter, tmp_path):
     make_run(), make_run("chronogs"), make_run("chronogs", seed=1)
     make_run("4dgs", device="cuda (Test)")
@@ -60,6 +70,23 @@ def test_a_value_without_its_image_is_refused(make_run, tmp_path):
     del document["images"][0]
     manifest.write_text(json.dumps(document))
     with pytest.raises(ConfigError, match="other views in its rows than among its predictions"):
+        submit([run], tmp_path / "entries")
+
+
+def test_a_run_without_values_of_a_view_is_refused_with_its_name(make_run, tmp_path):
+    """Its mask ignores every pixel, so it is not scored."""
+    run = make_run()
+    rows = [row for row in read_rows(run) if row.view != "1/view2.png"]
+    record = read_run(run)
+    record.aggregates, record.periods = aggregate(rows)
+    write_run(run, record, rows)
+    with pytest.raises(ConfigError, match=r"no values of '1/view2\.png': an entry has all"):
+        submit([run], tmp_path / "entries")
+
+
+def test_images_of_another_program_are_refused(make_run, tmp_path):
+    run = make_run(strategy="external", preset="images")
+    with pytest.raises(ConfigError, match=r"images of another program .*: name the runs of bench"):
         submit([run], tmp_path / "entries")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import EXISTING_FOLDER, LPIPS_WEIGHTS, RUNS, split_list
+from chronoscene.cli.options import EXISTING_FOLDER, LPIPS_WEIGHTS, RUNS, refuse_options, split_list
 from chronoscene.cli.output import FORMAT, OUT_FILE, emit, say, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
@@ -54,7 +54,10 @@ def score(
     too.
     """
     with progress_bar("load the metrics") as bar:
-        scorers = make_scorers(parse_metrics(metrics) or None, lpips_weights=lpips_weights)
+        wanted = parse_metrics(metrics)
+        if wanted and not any(name.startswith("lpips_") for name in wanted):
+            refuse_options(("lpips_weights",), "without LPIPS among --metric")
+        scorers = make_scorers(wanted or None, lpips_weights=lpips_weights)
         if truth is not None:
             freeze_change_masks(runs, truth)
         outcomes = rescore(runs, scorers, progress=partial(bar, "runs"))

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import click
 
-from chronoscene.cli.options import PATH, reading_options
+from chronoscene.cli.options import PATH, reading_options, refuse_options
 from chronoscene.cli.output import (
     FORMAT,
     OUT_FILE,
@@ -133,6 +133,8 @@ def command(
     request = StatsRequest(**options)  # type: ignore[arg-type]
     if request.cameras and request.figures is None:
         raise click.UsageError("--cameras needs --figures")
+    if request.figures is None:
+        refuse_options(("figure_format",), "without --figures")
     reading = {"format": request.dataset_format, "period_by": request.period_by}
     folders = folders or (nearby_scenes(**reading),)
     alone = len(folders) == 1

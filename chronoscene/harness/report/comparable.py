@@ -126,6 +126,11 @@ def apart(records: Sequence[RunRecord]) -> list[RunRecord]:
     return found
 
 
+def scene_of(name: str) -> str:
+    """Return the name of the scene, of one of its tests as `apart` calls it."""
+    return _APART.sub("", name)
+
+
 def several_scenes(names: Iterable[str]) -> bool:
     """Return True if a mean over scenes says something: of several, with one test of each.
 
@@ -133,7 +138,7 @@ def several_scenes(names: Iterable[str]) -> bool:
         names: As `apart` gives them.
     """
     tests = {*names}
-    return len(tests) > 1 and len({_APART.sub("", name) for name in tests}) == len(tests)
+    return len(tests) > 1 and len({*map(scene_of, tests)}) == len(tests)
 
 
 def each_once(records: Iterable[RunRecord]) -> list[RunRecord]:

@@ -98,15 +98,21 @@ def degrees_of_freedom(n: int) -> float:
     return float(np.trace(product) ** 2 / np.trace(product @ product))
 
 
-def pooled_freedom(counts: Iterable[int]) -> float:
-    """Compute the degrees of freedom of a mean over periods with so many views each.
+def pooled_freedom(counts: Iterable[int], weights: Iterable[float] | None = None) -> float:
+    """Compute the degrees of freedom of a weighted sum of means over so many views each.
 
     The formula is that of Satterthwaite (1946), for views that vary alike in all periods.
+
+    Args:
+        counts: Views of each period.
+        weights: Weight of the mean of each period, up to a common factor; None for equal ones.
     """
     counts = [*counts]
-    total = sum(1 / n for n in counts)
-    spread = sum(1 / n**2 / degrees_of_freedom(n) for n in counts)
-    return total**2 / spread if counts else math.nan
+    weights = [1.0] * len(counts) if weights is None else weights
+    variances = [w**2 / n for n, w in zip(counts, weights, strict=True)]
+    freedoms = map(degrees_of_freedom, counts)
+    spread = math.fsum(v**2 / f for v, f in zip(variances, freedoms, strict=True))
+    return math.fsum(variances) ** 2 / spread if counts else math.nan
 
 
 def interval(

@@ -17,7 +17,7 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.harness.files.records import Failure, RunRecord, read_failures, run_folders
-from chronoscene.harness.report.comparable import apart, each_once
+from chronoscene.harness.report.comparable import apart, each_once, scene_of
 from chronoscene.harness.report.differences import (
     SeedSpread,
     explained_by_seeds,
@@ -348,7 +348,8 @@ def _freedom(column: str, views: frozenset[tuple[str, int, str]]) -> float:
     """
     counts = Counter((scene, period) for scene, period, _ in views)
     if column in ("macro", "micro"):
-        return pooled_freedom(counts.values())
+        periods = Counter(scene for scene, _ in counts)  # that a scene is the mean of
+        return pooled_freedom(counts.values(), [1 / periods[scene] for scene, _ in counts])
     # A period, or an aggregate that is mostly one period
     of_one = [n for (_, i), n in counts.items() if column == f"period {i}"] or [*counts.values()]
     return min(map(degrees_of_freedom, of_one), default=math.nan)
@@ -480,7 +481,8 @@ def _scores(
 ) -> Iterator[Number]:
     """Yield means of periods and aggregates; ``views``: values by period and name of the view."""
     means = {int(i): values[metric] for i, values in run.periods.items() if metric in values}
-    drawn = {i: resampled_means(values, f"{run.scene}/{i}") for i, values in views.items()}
+    scene = scene_of(run.scene)  # whatever other tests of it there are
+    drawn = {i: resampled_means(values, f"{scene}/{i}") for i, values in views.items()}
     for i in sorted(means):
         yield metric, f"period {i}", means[i], drawn.get(i, UNKNOWN)
     of_views = [np.array([*values.values()]) for values in views.values()]

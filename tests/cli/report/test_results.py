@@ -297,6 +297,12 @@ def test_changes_are_told(score, tmp_path):
     ]
 
 
+def test_weights_that_no_metric_needs_are_refused(tmp_path):
+    command = ["score", str(tmp_path), "--metric", "psnr,flip", "--lpips-weights", str(tmp_path)]
+    with pytest.raises(ConfigError, match="--lpips-weights: expected none without LPIPS"):
+        CliRunner().invoke(cli, command, catch_exceptions=False)
+
+
 def test_a_run_that_cannot_be_scored_gives_status_1(score, tmp_path):
     result = score(
         Rescored(tmp_path / "s/m/seed0", [], [], "an image was edited"),

@@ -1,5 +1,7 @@
 """Intervals: coverage on paths whose mean is known, closed forms, what is drawn alike."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from made_runs import smooth
@@ -77,6 +79,9 @@ def test_degrees_of_freedom():
     assert pooled_freedom([9, 9, 9]) == pytest.approx(3 * degrees_of_freedom(9))
     assert np.isnan(degrees_of_freedom(1)) and np.isnan(pooled_freedom([]))
     assert degrees_of_freedom(4) < pooled_freedom([4, 100]) < degrees_of_freedom(4) * 1.2
+    assert pooled_freedom([6, 6], [9, 1]) == pytest.approx(82**2 / 6562 * degrees_of_freedom(6))
+    mixed = [5, 7, 9, 3, 11]  # the last digit does not depend on the order
+    assert len({pooled_freedom(order) for order in permutations(mixed)}) == 1
 
 
 def test_neighbours_are_drawn_together_around_the_circle():

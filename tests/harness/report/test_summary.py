@@ -9,6 +9,7 @@ from scipy.special import stdtrit
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files.records import ViewScore
+from chronoscene.harness.report.comparable import apart
 from chronoscene.harness.report.intervals import (
     degrees_of_freedom,
     interval,
@@ -221,6 +222,27 @@ def test_scenes_are_averaged_with_their_intervals_and_spreads():
     assert (mean.mean - mean.low) == pytest.approx(expected, rel=0.1)
     means = {cost.quantity: cost.mean for cost in costs}
     assert (means["checkpoint_bytes"], means["seconds"]) == (1_234_000, 10.0)
+
+
+def test_runs_of_another_width_do_not_change_an_interval():
+    run, other = scored(psnr=VIEWS), scored(psnr=VIEWS, max_width=800)
+    (alone,) = summarise([run]).query("column == 'macro'").itertuples()
+    beside, _ = summarise(apart([run, other])).query("column == 'macro'").itertuples()
+    assert beside.scene == "plaza [width 1600]"
+    assert (beside.low, beside.high) == (alone.low, alone.high)
+
+
+def test_a_scene_of_one_period_decides_the_interval_of_the_mean_of_scenes():
+    """It has half of the weight, and its few views estimate the variance badly."""
+    runs = [scored(psnr=[VIEWS[0]], scene="quay"), scored(psnr=[VIEWS[0]] * 9, scene="plaza")]
+    entries = summarise(runs)
+    (mean,) = over_scenes(entries, "mean").query("quantity == 'psnr'").itertuples()
+    alone, _ = entries.query("column == 'macro'").itertuples()
+    freedom = pooled_freedom([9] * 10, [9] + [1] * 9)
+    assert freedom < 1.3 * degrees_of_freedom(9)
+    wider = stdtrit([freedom, degrees_of_freedom(9)], 0.975)
+    expected = (alone.mean - alone.low) / 2 * (1 + 1 / 9) ** 0.5 * wider[0] / wider[1]
+    assert (mean.mean - mean.low) == pytest.approx(expected, rel=0.1)
 
 
 def test_published_rows():
