@@ -11,6 +11,7 @@ from chronoscene.formats import detect, load_format, writable_formats
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.io.staging import check_outside
 from chronoscene.scene import Scene
+from chronoscene.scene.cameras import way_to_pinhole
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 
@@ -96,11 +97,12 @@ def obstacles(scene: Scene) -> list[str]:
     """List the reasons for which a benchmark would refuse the scene as it is."""
     found = []
     cameras = {f.camera.camera_id: f.camera for f in scene.frames}.values()
-    distorted = sorted({camera.model for camera in cameras if not camera.is_pinhole})
-    if distorted:
+    ways = {camera.model: way_to_pinhole(camera) for camera in cameras if not camera.is_pinhole}
+    for way in sorted(set(ways.values())):
+        models = ", ".join(sorted(model for model in ways if ways[model] == way))
         found.append(
-            f"cameras have lens distortion ({', '.join(distorted)}), which is kept; methods need "
-            "undistorted images: run chronoscene undistort"
+            f"cameras have lens distortion ({models}), which is kept; methods need undistorted "
+            f"images: {way}"
         )
     if not len(scene.points):
         found.append(

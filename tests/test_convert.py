@@ -234,6 +234,18 @@ def test_obstacles(make_scene_folder):
     assert "no points" in points and "chronoscene split" in tests
 
 
+@pytest.mark.parametrize("target", ["cl-splats", "nerfstudio", "neusc", "wat"])
+def test_panoramas_cannot_be_undistorted(make_scene_folder, tmp_path, target):
+    scene = read_scene(make_scene_folder())
+    camera = Camera(1, "EQUIRECTANGULAR", 64, 48, (64, 48))
+    scene = scene.with_frames([dataclasses.replace(f, camera=camera) for f in scene.frames])
+    assert [found.rpartition(": ")[2] for found in obstacles(scene)] == [
+        "render perspective views of the panoramas, and register those"
+    ]
+    with pytest.raises(SceneError, match="render perspective views of the panoramas"):
+        load_format(target).write(scene, tmp_path / "out")
+
+
 @pytest.mark.parametrize("source", ["copy", "link", "symlink"])
 def test_two_names_of_one_file_are_refused(make_scene_folder, tmp_path, source):
     scene = read_scene(make_scene_folder({"a/0.png": 0, "b/0.png": 1}))

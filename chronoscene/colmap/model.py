@@ -115,6 +115,10 @@ def read_model(folder: Path) -> Model:
         with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
             reconstruction = read_reconstruction(folder)
             reconstruction.write_binary(temporary)
+            for image_id, name in text.read_long_names(folder / "images.txt").items():
+                if image_id in reconstruction.images:
+                    whole: Any = name.encode("utf-8", "surrogateescape")
+                    reconstruction.images[image_id].name = whole
             images = _posed_images(folder, reconstruction)
             raw = binary.read_images(Path(temporary) / "images.bin")
             points = binary.read_points(Path(temporary) / "points3D.bin")

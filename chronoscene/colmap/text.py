@@ -117,6 +117,18 @@ def read_images(path: Path) -> RawImages:
     )
 
 
+def read_long_names(path: Path) -> dict[int, str]:
+    """Names with blanks, by image id: COLMAP's own reader cuts them at the first blank."""
+    names = {}
+    lines = _lines(path)
+    for _, line in _records(lines):
+        next(lines, None)  # keypoints
+        fields = line.split(maxsplit=9)
+        if len(fields) == 10 and " " in fields[9] and fields[0].isdecimal():
+            names[int(fields[0])] = fields[9]
+    return names
+
+
 def read_points(path: Path) -> RawPoints:
     """Points sorted by id.
 

@@ -49,9 +49,11 @@ _DAY = re.compile(r"day_([0-9]{1,9})_")
 
 def matches(path: Path, model: FoundModel | None) -> bool:
     """Return True if a folder is a real scene or a rendered level."""
-    if model is not None and any(map(_DAY.match, colmap_layout.scan(path / model[1])[1])):
-        return True
-    return _is_level(path)
+    return _is_real(path, model) or _is_level(path)
+
+
+def _is_real(path: Path, model: FoundModel | None) -> bool:
+    return model is not None and any(map(_DAY.match, colmap_layout.scan(path / model[1])[1]))
 
 
 def _is_level(path: Path) -> bool:
@@ -60,7 +62,7 @@ def _is_level(path: Path) -> bool:
 
 def read(path: Path, *, period_by: str = "step", model: FoundModel | None = None) -> Scene:
     """Read a scene."""
-    if (path / TRAIN).exists():
+    if (path / TRAIN).exists() and not _is_real(path, model):
         return _read_level(path, period_by)
     return colmap_layout.read_scene(path, model, partial(assign, period_by=period_by), NAME)
 
@@ -169,6 +171,7 @@ def _written_names(scene: Scene) -> dict[str, str]:
     steps = {(f.period, _step(f.name)) for f in scene.frames if "/" not in f.name}
     ordered = [step for _, step in sorted(steps)]
     named = all(_DAY.match(f.name) and "/" not in f.name for f in scene.frames)
-    if named and len(steps) == scene.num_periods and ordered == sorted(ordered, key=natural_key):
+    is_table = ordered == sorted(set(ordered), key=natural_key)  # one period for each step
+    if named and len(steps) == scene.num_periods and is_table:
         return {f.name: f.name for f in scene.frames}
     return {f.name: f"day_{f.period}_" + f.name.replace("/", "_") for f in scene.frames}

@@ -45,6 +45,7 @@ from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.documents import json_error, number, read_json_document
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
+from chronoscene.scene.cameras import way_to_pinhole
 from chronoscene.scene.similarity import Sim3
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
@@ -371,7 +372,7 @@ def _camera_keys(camera: Camera) -> dict[str, Any]:
             f"camera {camera.camera_id}",
             expected=f"a camera model that nerfstudio has: {', '.join(transforms.MODEL_KEYS)}",
             found=model,
-            todo="run chronoscene undistort first",
+            todo=f"{way_to_pinhole(camera)} first",
         )
     K = camera.K
     return {

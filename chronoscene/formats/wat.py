@@ -27,7 +27,7 @@ from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_labels
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Camera, Scene
-from chronoscene.scene.cameras import as_pinhole
+from chronoscene.scene.cameras import as_pinhole, way_to_pinhole
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "wat"
@@ -109,7 +109,7 @@ def _one_camera(scene: Scene, out: Path) -> Camera:
             found=f"{len(cameras) + 1} cameras" if cameras else camera.model,
             todo="choose another format with --to"
             if cameras
-            else "run chronoscene undistort first",
+            else f"{way_to_pinhole(camera)} first",
         )
     return camera
 

@@ -130,6 +130,13 @@ def as_pinhole(camera: Camera) -> Camera:
     return replace(camera, model="PINHOLE", params=(fx, fy, cx, cy))
 
 
+def way_to_pinhole(camera: Camera) -> str:
+    """Advice on a camera with distortion."""
+    if camera.model == "EQUIRECTANGULAR":  # `undistorted_camera` refuses it
+        return "render perspective views of the panoramas, and register those"
+    return "run chronoscene undistort"
+
+
 def project_points(camera: Camera, xyz: Array) -> Array:
     """Project points to pixels, distortion included.
 

@@ -196,6 +196,8 @@ def _check(settings: SplitSettings) -> None:
         wrong = ("--offset", "0 or more, and less than 1 / fraction", settings.offset)
     elif settings.seed is not None and settings.seed < 0:
         wrong = ("--seed", "0 or more", settings.seed)
+    elif settings.seed is not None and settings.offset:
+        wrong = ("--offset", "0 with --seed, which draws the images", settings.offset)
     elif settings.blocks is not None and settings.blocks < 2:
         wrong = ("--blocks", "2 or more", settings.blocks)
     if wrong is not None:

@@ -11,9 +11,9 @@ from chronoscene.errors import ConfigError
 KINDS = ("aerial", "street", "facing")
 
 
-def _within(low: float, high: float, default: float) -> Any:
-    """A field whose value must lie in a range."""
-    return field(default=default, metadata={"range": (low, high)})
+def _within(low: float, high: float, default: float, *, option: str | None = None) -> Any:
+    """A field whose value must lie in a range; ``option`` is its name for users, if another."""
+    return field(default=default, metadata={"range": (low, high), "option": option})
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +25,9 @@ class SynthSettings:
     ``facing``: a few metres in front of the city, looking one way."""
     periods: int = _within(1, 50, 3)
     """Number of dates of capture, T."""
-    width: int = _within(16, 8192, 320)
+    width: int = _within(16, 8192, 320, option="size")
     """Pixels."""
-    height: int = _within(16, 8192, 240)
+    height: int = _within(16, 8192, 240, option="size")
     """Pixels."""
     views: int = _within(4, 5000, 33)
     """Mean number of images per period; the periods differ around it."""
@@ -60,7 +60,7 @@ class SynthSettings:
             low, high = option.metadata.get("range", (value, value))
             if not low <= value <= high:
                 raise ConfigError(
-                    f"--{option.name}",
+                    f"--{option.metadata['option'] or option.name}",
                     expected=f"a value from {low} to {high}",
                     found=str(value),
                     todo="choose a value in this range",

@@ -125,6 +125,17 @@ def test_an_image_without_a_pose_is_not_registered(make_scene_folder):
     assert [i.image_id for i in read_model(folder).images] == [1, 3, 4]
 
 
+def test_names_with_blanks_in_a_text_model(make_scene_folder):
+    """COLMAP reads both images of the first folder as `2016`."""
+    names = {"2016 spring/a 1.png": 0, "2016 spring/b.png": 0, "2017/c.png": 1, "2017/d  ü.png": 1}
+    scene = read_scene(make_scene_folder(names, form="text"))
+    assert {frame.name: frame.period for frame in scene.frames} == names
+    images = scene.root / "sparse" / "0" / "images.txt"
+    images.write_bytes(images.read_bytes().replace(b"a 1.png", b"a \xff.png"))
+    with pytest.raises(SceneError, match="expected image names in UTF-8, found image"):
+        read_scene(scene.root)
+
+
 def test_binary_wins_over_text(make_scene_folder):
     folder = make_scene_folder() / "sparse" / "0"
     for stem in ("cameras", "images", "points3D"):

@@ -23,6 +23,14 @@ def test_days_are_periods_and_other_names_day_0(colmap_folder):
     assert (periods["frame_1.png"], periods["day_2_00.png"], periods["day_10_00.png"]) == (0, 1, 2)
 
 
+def test_a_model_counts_more_than_poses_in_other_files(colmap_folder):
+    """As in the loader of CL-Splats, and in the validator."""
+    folder = colmap_folder(REAL)
+    (folder / "transforms_train.json").write_text('{"frames": []}')
+    scene = read_scene(folder)
+    assert (scene.num_periods, len(scene.frames)) == (3, len(REAL)) and len(scene.points)
+
+
 def test_every_8th_of_all_is_for_testing(colmap_folder):
     tests = [f.name for f in read_scene(colmap_folder(REAL)).select(split="test")]
     assert tests == [sorted(REAL)[0], sorted(REAL)[8]]
@@ -86,7 +94,14 @@ def test_a_missing_image_whose_size_is_needed(level):
         read_scene(folder)
 
 
-@pytest.mark.parametrize("names", [["a/0.png", "b/0.png", "b/1.png"], ["x 1.png", "y.1.png"]])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["a/0.png", "b/0.png", "b/1.png"],
+        ["x 1.png", "y.1.png"],
+        ["day_0_a.png", "day_0_b.png"],  # one step in two periods
+    ],
+)
 def test_what_is_written_says_the_time_step_in_the_name(make_scene_folder, tmp_path, names):
     scene = read_scene(make_scene_folder({name: min(i, 1) for i, name in enumerate(names)}))
     out = cl_splats.write(scene, tmp_path / "out", image_source="symlink")

@@ -78,6 +78,7 @@ def test_stratified_offset_and_seed():
         ({"fraction": float("nan")}, "--fraction"),
         ({"offset": 8}, "--offset"),
         ({"offset": -1}, "--offset"),
+        ({"offset": 3, "seed": 1}, "--offset"),
         ({"seed": -1}, "--seed"),
         ({"strategy": "blocked", "blocks": 1}, "--blocks"),
         ({"strategy": "blocked", "blocks": 100}, "--blocks"),

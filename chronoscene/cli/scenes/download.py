@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import PATH
+from chronoscene.cli.options import PATH, refuse_options
 from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.download.catalogue import DATASETS, Dataset
@@ -36,6 +36,7 @@ def command(name: str | None, scenes: tuple[str, ...], out: Path | None) -> None
     host. Environment variables of huggingface_hub, such as HF_ENDPOINT and HF_TOKEN, are used.
     """
     if name is None:
+        refuse_options(["out"], "without NAME")
         emit(plain_text(_table()), None)
     elif name == WEIGHTS:
         _download_weights(scenes, out)
@@ -43,6 +44,7 @@ def command(name: str | None, scenes: tuple[str, ...], out: Path | None) -> None
         _download_dataset(DATASETS[name], scenes, out or Path("data") / name)
     else:
         dataset = DATASETS[name]
+        refuse_options(["scenes", "out"], f"with {name}, which only people can download")
         emit(f"{dataset.title} is on {dataset.host}. By hand: {dataset.by_hand}\n", None)
         emit(_after(dataset, Path(name)), None)
         click.get_current_context().exit(BY_HAND)

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import PATH, reading_options
+from chronoscene.cli.options import PATH, reading_options, refuse_options
 from chronoscene.cli.output import A_FILE, check_place, emit, writing_to
 from chronoscene.cli.progress import announce, progress_bar
 from chronoscene.cli.scenes.reading import describe_period, read_and_note, show_note
@@ -82,6 +82,8 @@ def command(
     beside it records the settings. SCENE is not changed; --scene-out writes a copy with the new
     split.
     """
+    if options["strategy"] in ("periods", "none"):
+        refuse_options(["fraction", "every"], f"with --strategy {options['strategy']}")
     _check_targets(source, out, scene_out)
     announce(f"read {source}")
     scene = read_and_note(source, dataset_format, period_by)

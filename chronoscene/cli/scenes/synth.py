@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
 
 from chronoscene.cli.options import PATH
+from chronoscene.cli.output import say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
+from chronoscene.io.wording import counted
 from chronoscene.synth import PRESETS, generate, preset
 from chronoscene.synth.settings import KINDS
 
@@ -44,8 +45,7 @@ def command(out: Path, name: str, size: str | None, **changes: Any) -> None:
     settings = preset(name, **given)
     with progress_bar() as bar:
         generate(out, settings, lambda done, total, what: bar(what, done, total))
-    console = Console(stderr=True, soft_wrap=True)
-    console.print(f"{out}: {settings.periods} periods, seed {settings.seed}", highlight=False)
+    say(f"{out}: {counted(settings.periods, 'period')}, seed {settings.seed}")
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -24,7 +24,7 @@ from chronoscene.images.masks import find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Scene
-from chronoscene.scene.cameras import as_pinhole
+from chronoscene.scene.cameras import as_pinhole, way_to_pinhole
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 
@@ -222,7 +222,7 @@ def readable_camera(camera: Camera, models: Collection[str], loader: str) -> Cam
         f"camera {camera.camera_id}",
         expected=f"a camera that {loader} reads: {', '.join(models)}",
         found=camera.model,
-        todo="run chronoscene undistort first",
+        todo=f"{way_to_pinhole(camera)} first",
     )
 
 

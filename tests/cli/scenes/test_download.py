@@ -78,6 +78,19 @@ def test_other_hosts_are_for_people():
     assert "next: chronoscene validate 5pointz\n" in result.stdout
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["5pointz", "--out", "data"], "--out: expected none with 5pointz, which only people can"),
+        (["5pointz", "wall"], "scenes: expected none with 5pointz, which only people can"),
+        (["--out", "data"], "--out: expected none without NAME"),
+    ],
+)
+def test_arguments_without_effect_are_refused(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        run(*arguments)
+
+
 def test_lists_what_there_is():
     lines = run().stdout.splitlines()
     assert [line.split()[0] for line in lines[3:]] == [*DATASETS, "lpips-weights"]

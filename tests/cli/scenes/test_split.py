@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import cli, main
+from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.scene.splits import split_hash
 
@@ -48,6 +49,14 @@ def test_the_list_makes_the_split_that_the_hash_names(scene, tmp_path):
     (scene / "sparse/0/test.txt").write_bytes((tmp_path / "t.txt").read_bytes())
     record = json.loads((tmp_path / "t.json").read_text())
     assert split_hash(read_scene(scene)) == record["split_hash"]
+
+
+@pytest.mark.parametrize("option", [("--every", 8), ("--fraction", 0.125)])
+@pytest.mark.parametrize("strategy", [("periods", "--period", 1), ("none",)])
+def test_a_share_is_refused_where_it_has_no_effect(scene, tmp_path, option, strategy):
+    message = f"{option[0]}: expected none with --strategy {strategy[0]}"
+    with pytest.raises(ConfigError, match=message):
+        run(scene, tmp_path / "t.txt", "--strategy", *strategy, *option)
 
 
 def test_scene_out(scene, tmp_path):

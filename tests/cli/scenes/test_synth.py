@@ -29,11 +29,18 @@ def test_makes_the_scene_that_the_options_ask_for(tmp_path: Path) -> None:
     assert 0 < len(scene.points) <= 60
 
 
+def test_says_what_it_made(tmp_path: Path) -> None:
+    out = tmp_path / "[bold] place"
+    options = ["--preset", "tiny", "--periods", "1", "--size", "16x16", "--views", "4"]
+    result = CliRunner().invoke(cli, ["synth", str(out), *options], catch_exceptions=False)
+    assert result.stderr.splitlines()[-1] == f"{out}: 1 period, seed 0"
+
+
 @pytest.mark.parametrize(
     ("option", "place"),
     [
         (["--size", "320"], "--size"),
-        (["--size", "0x10"], "--width"),
+        (["--size", "0x10"], "--size: expected a value from 16 to 8192, found 0"),
         (["--size", "-4x10"], "--size"),
         (["--preset", "huge"], "--preset"),
         (["--periods", "0"], "--periods"),
