@@ -31,7 +31,7 @@ class CLSplatsConfig(GaussianConfig):
     """Radius by which masks grow at last."""
 
     # Which Gaussians are optimised
-    vote_share: NonNegativeFloat = 0.5
+    vote_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Gaussians are, if in more than this share of the views that see them they have changed."""
     samples: NonNegativeInt = 2_000
     """Points drawn in front of what the model before shows in changed pixels; new Gaussians start
@@ -40,7 +40,7 @@ class CLSplatsConfig(GaussianConfig):
     # Where they may be
     sphere_link: NonNegativeFloat = 0.1
     """Gaussians nearer than this, times their extent, are in one sphere."""
-    sphere_share: NonNegativeFloat = 0.95
+    sphere_share: Annotated[float, Field(ge=0, le=1)] = 0.95
     """Share of the Gaussians of a sphere that lie within its radius."""
     sphere_margin: NonNegativeFloat = 0.02
     """Outside of a sphere, times the extent of the cameras, that is still inside."""

@@ -17,7 +17,8 @@ from baselines.cl_splats.trainer import CLSplatsTrainer
 from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.gaussians.model import SHAPES, initialise
 from chronoscene.gaussians.trainer import GaussianTrainer
-from chronoscene.methods import TrainingSet
+from chronoscene.methods import TrainingSet, View
+from chronoscene.training.drawing import Splats
 
 
 class CLSplats(GaussianMethod):
@@ -67,6 +68,11 @@ class CLSplats(GaussianMethod):
             seed=self.trainer.seed,
         )
         return self.model
+
+    def splats(self, view: View, period: float, appearance_period: float) -> Splats:
+        """Each Gaussian has one colour: of another period there is the exposure alone to take."""
+        del appearance_period
+        return self.model.splats(view, period)
 
     def restore_model(self, tensors: dict[str, Tensor]) -> PeriodModel:
         """The model with nothing in training."""

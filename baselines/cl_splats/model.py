@@ -40,7 +40,7 @@ class PeriodModel(GaussianModel):
 
     def at_period(self, period: float) -> Mapping[str, Tensor]:
         living = self.living(int(period))
-        if period < self.period:
+        if period < self.period and len(self.kept[LIVES]):
             return living
         return {name: torch.cat([living[name], self.parameters[name]]) for name in SHAPES}
 
@@ -52,8 +52,10 @@ class PeriodModel(GaussianModel):
         return self._living[1]
 
     def living_rows(self, period: int) -> Tensor:
-        """Their rows in `kept`. int64"""
+        """Their rows in `kept`; before the first period that has any, those of that. int64"""
         begin, end = self.kept[LIVES].unbind(-1)
+        if len(begin):
+            period = max(period, int(begin.min()))
         return ((begin <= period) & ((end == 0) | (period < end))).nonzero()[:, 0]
 
     def rows(self, period: int) -> Tensor:

@@ -15,7 +15,7 @@ from chronoscene.fields.grid import GridLayout
 class ReplayConfig(FieldConfig):
     """Options of fields that are learned period by period."""
 
-    log2_rows: PositiveInt = 19
+    log2_rows: Annotated[int, Field(ge=4, le=24)] = 19
     samples: PositiveInt = 262_144
     replay: Literal["none", "stored", "rendered"] = "rendered"
     """Replay of earlier periods under ``sequential``: nothing; the photos that were

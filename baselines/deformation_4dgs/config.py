@@ -20,7 +20,7 @@ class Deformation4DGSConfig(GaussianConfig):
 
     iterations: PositiveInt = 18_000
     schedule_length: PositiveInt = 20_000
-    ssim_weight: float = 0.0
+    ssim_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
     densify_until: NonNegativeInt = 10_000
     grow_below: NonNegativeInt = 360_000
     prune_above: NonNegativeInt = 200_000

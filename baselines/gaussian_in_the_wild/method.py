@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from baselines.gaussian_in_the_wild.config import GaussianInTheWildConfig
@@ -118,6 +120,10 @@ class GaussianInTheWild(GaussianMethod):
         kept = {k: v for k, v in model.shared.items() if not k.startswith(_PHOTO)}
         groups = {name: model.parameters[name] for name in SHAPES}
         return groups | kept | {"period_features": features}
+
+    def permute(self, order: NDArray[np.int64]) -> None:
+        super().permute(order)
+        self.model.period_features = self._read_periods()[torch.from_numpy(order)]
 
     def save(self, folder: Path) -> None:
         self.meta["networks"] = asdict(self.model.networks)

@@ -15,6 +15,8 @@ class NerfConfig(FieldConfig):
     """Options of the family; the flags `time`, `appearance` and `transient` make the methods."""
 
     opacity_weight: NonNegativeFloat = 0.0
+    """Weight of the entropy -o log o of the rays' opacities o in the loss; with a `transient` it
+    has no effect."""
     time: Literal["none", "frequencies", "steps"] = "none"
     """Dependence of colours on the time t = period / (T - 1): not; by sines and cosines of it
     (NeRF-T); by learned step functions, so that content switches (NeuSC)."""

@@ -96,15 +96,19 @@ class HaNerf(LitNerf):
 
     @torch.no_grad()
     def period_lights(self) -> Tensor:
-        """Return the mean code of the training photos of each period. [T, A]"""
+        """Return the mean code of the training photos of each period. [T, A]
+
+        Of all photos, where a period has none.
+        """
         if self.photos is None:
             return self.network.params["period_lights"]
         if self._means is None:
             layers = self.network.layers("encoder")
             codes = torch.cat([encode_photos(part, layers) for part in self.photos.split(_BATCH)])
             periods = self.pool.periods
-            chosen = [codes[periods == i] for i in range(int(self.meta["num_periods"]))]
-            self._means = torch.stack([part.sum(0) / max(len(part), 1) for part in chosen])
+            own = [codes[periods == i] for i in range(int(self.meta["num_periods"]))]
+            chosen = [part if len(part) else codes for part in own]
+            self._means = torch.stack([part.sum(0) / len(part) for part in chosen])
         return self._means
 
     def loss(self, drawn: Drawn, rays: Rays, progress: float) -> Tensor:

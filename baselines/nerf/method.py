@@ -110,10 +110,14 @@ class Nerf(FieldMethod):
         return torch.zeros(1, 0, device=self.device)
 
     def mean_light(self, weights: NDArray[np.float32]) -> Tensor:
-        """Return the mean code of the photos of periods with weights. [T] -> [1, A]"""
+        """Return the mean code of the photos of periods with weights. [T] -> [1, A]
+
+        Of all photos, where these periods have none.
+        """
         periods = np.array(self.meta["image_periods"])
         counts = np.bincount(periods, minlength=len(weights))
-        shares = self.tensor((weights / np.maximum(counts, 1))[periods].astype(np.float32))
+        own = (weights / np.maximum(counts, 1))[periods].astype(np.float32)
+        shares = self.tensor(own if own.any() else np.ones_like(own))
         lights = self.network.params["light_codes"]
         return (shares[:, None] * lights).sum(0, keepdim=True) / shares.sum()
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pydantic import NonNegativeInt, PositiveInt
 
-from chronoscene.anchors.config import AnchorConfig
+from chronoscene.anchors.config import AnchorConfig, Share
 
 
 @dataclass(frozen=True)
@@ -16,8 +16,8 @@ class ScaffoldGSConfig(AnchorConfig):
     iterations: PositiveInt = 30_000
     base_dim: NonNegativeInt = 32
     """Length of the feature of an anchor."""
-    statistics_from: float = 500 / 30_000
-    density_from: float = 1_500 / 30_000
+    statistics_from: Share = 500 / 30_000
+    density_from: Share = 1_500 / 30_000
     appearance_dim: NonNegativeInt = 0
     """Length of the appearance vectors that the colour MLP sees; 0, none, in all published scripts.
     ``scaffold-gs`` has one per training image and renders with their mean,

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 
 from chronoscene.errors import ConfigError
 from chronoscene.training.config import SplattingConfig
 
 Head = Literal["opacity", "covariance", "color"]
 HEADS: tuple[Head, ...] = ("opacity", "covariance", "color")  # The three MLPs
+Share = Annotated[float, Field(ge=0, le=1)]
+"""A moment as a share of the training: steps would be out of bounds."""
 _MAX_OFFSETS = 31  # Their use is stored in the bits of an int32
 
 
@@ -79,11 +81,11 @@ class AnchorConfig(SplattingConfig):
     """Learning rate of the MLP that gives colours."""
 
     # Growth and pruning
-    statistics_from: float = 500 / 40_000
+    statistics_from: Share = 500 / 40_000
     """Share of the training after which statistics of the views are collected."""
-    density_from: float = 1_500 / 40_000
+    density_from: Share = 1_500 / 40_000
     """Share after which anchors grow and are pruned."""
-    density_until: float = 0.5
+    density_until: Share = 0.5
     """Share at which the set of anchors is final."""
     density_interval: PositiveInt = 100
     """Steps from one round to the next."""
@@ -101,7 +103,7 @@ class AnchorConfig(SplattingConfig):
     """``opacity`` (code); ``gradient`` (main text of the paper); ``both``."""
     prune_gradient: float = 1e-6
     """Summed gradient per visit below which ``gradient`` prunes; the paper gives no value."""
-    unused_share: NonNegativeFloat = 0.0
+    unused_share: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the light of any period that may be lost when, once growth is over, the anchors that
     add least to the training views are dropped, and single offsets likewise. 0: none. Not in the
     papers."""

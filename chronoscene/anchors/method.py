@@ -202,6 +202,7 @@ class AnchorMethod(SplattingMethod):
                 folder / META_FILE, expected="a layout", found="none", todo="train again"
             )
         layout = AnchorLayout.from_meta(self.meta["layout"])
+        self.config = dataclasses.replace(self.config, near_plane=layout.near_plane)
         try:
             restored = self.restored_tensors(tensors, layout)
             self._model = self.model_class.from_tensors(layout, restored)

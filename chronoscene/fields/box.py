@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy import float32
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.kernels.compilation import inlined
@@ -43,9 +44,14 @@ class SceneBox:
         return torch.stack([(x - middle) / self.half for x, middle in axes], dim=1).float()
 
 
+def finite_points(train: TrainingSet) -> NDArray[np.float32]:
+    """Return the sparse points whose coordinates are finite. [P, 3]"""
+    return train.points[np.isfinite(train.points).all(axis=1)]
+
+
 def box_of(train: TrainingSet) -> SceneBox:
     """Return the box of the sparse points; that of the cameras where there are hardly any."""
-    points = train.points.astype(np.float64)
+    points = finite_points(train).astype(np.float64)
     if len(points) < _FEW_POINTS:
         points = np.stack([camera_centre(view.cam_from_world) for view in train.views])
         points = np.concatenate((points, points.mean(axis=0) + np.array([[-1.0], [1.0]])))

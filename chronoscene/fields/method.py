@@ -150,7 +150,7 @@ class FieldMethod(ABC):
         }
         self.network = self.network_class(self.config, leaves)
         self.optimizer = Adam(leaves)
-        self.num_rays = _FIRST_RAYS
+        self.num_rays = min(_FIRST_RAYS, self.config.most_rays)
 
     def step(self, index: int, progress: float) -> StepReport:
         assert self.optimizer is not None, "setup comes first"
@@ -199,8 +199,8 @@ class FieldMethod(ABC):
         # Slowly, as a step is only a sample of all rays.
         wanted = min(max(wanted, 0.8 * self.num_rays), 1.25 * self.num_rays)
         # No step needs a large part of all pixels.
-        most = min(self.config.most_rays, len(self.pool) // _PIXELS_PER_RAY)
-        self.num_rays = max(_FEWEST_RAYS, min(int(wanted), most))
+        wanted = max(_FEWEST_RAYS, min(wanted, len(self.pool) // _PIXELS_PER_RAY))
+        self.num_rays = min(int(wanted), self.config.most_rays)
 
     def draw_rays(self, generator: np.random.Generator) -> Rays:
         """Draw the rays of a step."""

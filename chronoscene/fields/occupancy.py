@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from torch import Tensor
 
-from chronoscene.fields.box import SceneBox
+from chronoscene.fields.box import SceneBox, finite_points
 from chronoscene.fields.marching import march
 from chronoscene.fields.rays import PixelPool
 from chronoscene.methods import TrainingSet
@@ -147,7 +147,7 @@ def start_occupancy(
     it while it stops a further half per cent of them.
     """
     allowed = np.zeros((cells,) * 3, bool)
-    points = box.to_cube(torch.from_numpy(train.points)).numpy()
+    points = box.to_cube(torch.from_numpy(finite_points(train))).numpy()
     at = np.floor((points + 1) * cells / 2).astype(np.int64)
     at = at[((at >= 0) & (at < cells)).all(axis=1)]
     if len(at) == 0 or len(pool) == 0:

@@ -19,7 +19,7 @@ from functools import cache
 from textwrap import dedent
 from typing import Any, ClassVar, Protocol, get_type_hints
 
-from pydantic import PydanticUserError, TypeAdapter, ValidationError
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from chronoscene.checks import check_choice, nearest
 from chronoscene.errors import ConfigError
@@ -99,12 +99,16 @@ def check_options(config: Options) -> None:
             raise _refusal(name, error) from error
 
 
+_FINITE = ConfigDict(allow_inf_nan=False)  # A config is stored as JSON, which has no others
+
+
 @cache
 def _adapters(config_class: type[Options]) -> dict[str, TypeAdapter[Any]]:
     """Return what checks and reads each option, by its name."""
     try:
         kinds = get_type_hints(config_class, include_extras=True)
-        return {f.name: TypeAdapter(kinds[f.name]) for f in dataclasses.fields(config_class)}
+        fields = dataclasses.fields(config_class)
+        return {f.name: TypeAdapter(kinds[f.name], config=_FINITE) for f in fields}
     except (NameError, PydanticUserError) as error:
         raise ConfigError(
             f"{config_class.__module__}.{config_class.__name__}",

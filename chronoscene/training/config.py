@@ -30,7 +30,7 @@ class SplattingConfig:
     """Lower the opacity of Gaussians that are small on the screen, so that the rasterizer's blur
     adds no light to them: what is thin keeps its brightness at other image sizes than those
     trained on (Yu et al. 2024, Mip-Splatting)."""
-    ssim_weight: float = 0.2
+    ssim_weight: Annotated[float, Field(ge=0, le=1)] = 0.2
     """Weight of 1 - SSIM in the loss; L1 gets the rest."""
     absgrad: bool = False
     """Add Gaussians where the sum over the pixels of a centre's absolute gradients is large, which

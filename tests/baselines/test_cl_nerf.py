@@ -103,3 +103,8 @@ def test_colours_of_another_period_leave_the_depth() -> None:
 def test_a_new_network_for_a_period_is_refused() -> None:
     with pytest.raises(ConfigError, match="start"):
         begun(start="fresh")
+
+
+def test_a_table_that_no_memory_holds_is_refused() -> None:
+    with pytest.raises(ConfigError, match="log2_rows: expected a value less than or equal to 24"):
+        begun(log2_rows=40)

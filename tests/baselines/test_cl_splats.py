@@ -324,6 +324,35 @@ def test_where_nothing_changes_nothing_is_trained() -> None:
         assert torch.equal(tensor, before[name]), name
 
 
+def test_of_another_period_a_view_takes_the_exposure_alone() -> None:
+    """Other Gaussians live there, so that their colours are of no use."""
+    method = begun(exposure="period")
+    method.extend(second(method))
+    run(method)
+    view = stage(0).views[0]
+    plain, split = (
+        method.render_split(view, geometry_period=0.0, appearance_period=period)
+        for period in (0.0, 1.0)
+    )
+    np.testing.assert_array_equal(split.alpha, plain.alpha)
+    np.testing.assert_array_equal(split.depth, plain.depth)
+    assert not np.array_equal(split.rgb, plain.rgb)
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_a_period_without_photos_shows_the_nearest_before_it_or_the_first(missing: int) -> None:
+    """A whole period may be held out: `chronoscene split --strategy periods`."""
+    data, known = stage(2), [period for period in range(3) if period != missing]
+    views = tuple(replace(view, period=known[i % 2]) for i, view in enumerate(data.views))
+    method = CLSplats(config())
+    method.setup(replace(data, views=views), seed=0, device="cpu")
+    for steps in (range(0), range(40), range(40, STEPS)):  # the second stage is in the last ones
+        run(method, steps)
+        image, other = (method.render(views[0], float(period)) for period in (missing, known[0]))
+        assert image.alpha is not None and image.alpha.max() > 0.1
+        np.testing.assert_array_equal(image.rgb, other.rgb)
+
+
 def test_what_lives_at_a_period_is_drawn_then_and_exported(tmp_path: Path) -> None:
     method = begun()
     method.extend(second(method))
@@ -452,6 +481,12 @@ def test_moments_are_steps_of_the_period_where_schedules_are_not_stretched(tmp_p
     second.load_training(tmp_path)
     steps(second, range(14, 20))
     assert moments == [*range(1, 11), *range(1, 11)]
+
+
+@pytest.mark.parametrize("name", ["vote_share", "sphere_share"])
+def test_shares_are_no_percentages(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"{name}: expected a value less than or equal to 1"):
+        CLSplatsConfig(**{name: 95.0})
 
 
 def test_random_moves_are_refused() -> None:

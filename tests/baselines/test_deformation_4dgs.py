@@ -303,7 +303,14 @@ def test_caps_of_the_released_code_are_in_the_presets_named_paper_alone(preset: 
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("plane_size", 1), ("levels", 0), ("box_quantile", 0.5), ("time_cells", 1)]
+    ("name", "value"),
+    [
+        ("plane_size", 1),
+        ("levels", 0),
+        ("box_quantile", 0.5),
+        ("time_cells", 1),
+        ("ssim_weight", -0.2),
+    ],
 )
 def test_impossible_options_are_named(name: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=name):

@@ -402,6 +402,19 @@ def test_the_features_of_periods_are_read_anew_after_a_step_and_a_resumed_traini
     assert not torch.equal(before, after) and not torch.equal(before, start)
 
 
+def test_gaussians_in_another_order_look_the_same(tmp_path: Path) -> None:
+    """What they read from photos goes with them: compressed models are sorted."""
+    scene = two_periods()
+    method = begun(scene, 40)
+    method.save(tmp_path)
+    loaded = GaussianInTheWild(method.config)
+    loaded.load(tmp_path, device="cpu")
+    loaded.permute(np.random.default_rng(0).permutation(len(loaded.model)))
+    for period in (0.0, 1.0):
+        image, other = (m.render(scene.views[0], period).rgb for m in (method, loaded))
+        np.testing.assert_allclose(other, image, rtol=0, atol=1e-5)
+
+
 def test_torch_has_its_threads_again_after_a_step() -> None:
     scene = toy_scene()
     torch.set_num_threads(2)

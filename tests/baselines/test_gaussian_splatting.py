@@ -118,7 +118,8 @@ def test_the_variant_for_periods_renders_each_with_its_exposure():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("iterations", 0), ("sh_degree", 4), ("near_plane", -1.0)]
+    ("name", "value"),
+    [("iterations", 0), ("sh_degree", 4), ("near_plane", -1.0), ("ssim_weight", 20.0)],
 )
 def test_impossible_options_are_named(name, value):
     with pytest.raises(ConfigError, match=name):

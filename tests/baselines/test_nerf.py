@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -119,6 +120,25 @@ def test_the_light_of_a_view_is_the_mean_of_its_period(neusc: Any) -> None:
     own = [i for i, view in enumerate(neusc.pool.views) if view.period == 1]
     found = neusc.view_codes(0.0, 1.0).color[0, neusc.config.time_steps :]
     torch.testing.assert_close(found, lights[own].mean(0))
+
+
+@pytest.mark.parametrize("name", ["neusc", "nerf-w-t", "ha-nerf-t"])
+def test_a_period_without_photos_has_the_mean_light_of_all(name: str, tmp_path: Path) -> None:
+    spec, every = load_spec(name), make_training_set(3)
+    kept = [i for i, view in enumerate(every.views) if view.period != 1]
+    views = tuple(every.views[i] for i in kept)
+    data = replace(every, views=views, load_image=lambda i: every.load_image(kept[i]))
+    method = import_object(spec.method)(build_config(spec, preset="fast", overrides=SMALL))
+    method.setup(data, seed=0, device="cpu")
+    light = method.view_codes(1.0, 1.0).color[0, -method.config.appearance_size :]
+    with torch.no_grad():
+        every_light = method.lights(torch.arange(len(views)))
+    torch.testing.assert_close(light, every_light.mean(0))
+    method.save(tmp_path)
+    loaded = type(method)(method.config)
+    loaded.load(tmp_path, device="cpu")
+    images = [m.render(views[0], 1.0).rgb for m in (method, loaded)]
+    assert np.isfinite(images[0]).all() and np.array_equal(*images)
 
 
 def test_sizes_are_those_of_the_card() -> None:

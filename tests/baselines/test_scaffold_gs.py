@@ -15,6 +15,7 @@ from baselines.scaffold_gs.config import ScaffoldGSConfig
 from baselines.scaffold_gs.method import ScaffoldGS, ScaffoldGSPeriod
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
+from chronoscene.errors import ConfigError
 from chronoscene.methods import TrainingSet, TrainingView, build_config
 from chronoscene.scene.similarity import Sim3
 
@@ -74,6 +75,30 @@ def test_the_schedule_of_the_official_code() -> None:
     steps = [config.iterations * s for s in (config.statistics_from, config.density_from)]
     assert (config.iterations, *steps) == (30_000, 500, 1_500)
     assert config.iterations * config.density_until == 15_000
+
+
+@pytest.mark.parametrize("name", ["statistics_from", "density_from", "density_until"])
+def test_moments_are_shares_and_not_steps(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"{name}: expected a value less than or equal to 1"):
+        ScaffoldGSConfig(**{name: 500.0})
+
+
+def test_the_near_plane_of_a_stored_model_is_in_its_own_unit(
+    train_set: TrainingSet, tmp_path: Path
+) -> None:
+    """Exports draw by it; options that a model is loaded with are in the unit of the world."""
+    scaled = replace(train_set, training_from_world=Sim3(0.1, np.eye(3), np.zeros(3)))
+    config = ScaffoldGSConfig(iterations=20, near_plane=15.0, antialiased=True, voxel_size=0.2)
+    method = ScaffoldGS(config)
+    method.setup(scaled, seed=0, device="cpu")
+    method.save(tmp_path)
+    loaded = ScaffoldGS(config)
+    loaded.load(tmp_path, device="cpu")
+    assert loaded.config.near_plane == method.config.near_plane == 1.5
+    cloud = method.to_gaussians(0.0, scaled.views)
+    one, two = (m.adapt_to_plain(cloud, scaled.views).opacities for m in (method, loaded))
+    np.testing.assert_array_equal(one, two)
+    assert (one < cloud.opacities).any()
 
 
 def test_one_period_equals_chronogs_without_time_step_by_step(train_set: TrainingSet) -> None:

@@ -66,6 +66,9 @@ def test_reading_the_specs_imports_nothing_heavy() -> None:
         ),
         ({"near_plane": -1.0}, "near_plane: expected a value greater than 0, found -1.0"),
         ({"density_interval": 0}, "density_interval: expected a value greater than 0, found 0"),
+        ({"density_from": 500.0}, "density_from: expected a value less than or equal to 1, found"),
+        ({"density_until": 2e4}, "density_until: expected a value less than or equal to 1, found"),
+        ({"unused_share": 1.0}, "unused_share: expected a value less than 1, found 1.0"),
     ],
 )
 def test_impossible_options_are_refused(values: dict[str, Any], message: str) -> None:

@@ -73,6 +73,14 @@ def test_threads_and_an_interruption_change_nothing(name: str, tmp_path: Path) -
     assert np.array_equal(loaded.render(view, 0.0).rgb, one.render(view, 0.0).rgb)
 
 
+def test_no_step_has_more_rays_than_asked_for() -> None:
+    method = begun("clnerf", make_training_set(1), most_rays=20)
+    drawn, draw = [], method.pool.draw
+    method.pool.draw = lambda generator, count: drawn.append(count) or draw(generator, count)  # type: ignore[method-assign]
+    go_on(method, 0, 3)
+    assert drawn == [20, 20, 20]
+
+
 def test_a_step_that_is_not_finite_changes_nothing(tmp_path: Path) -> None:
     method = begun("clnerf", make_training_set(1))
     go_on(method, 0, 1)
@@ -205,6 +213,15 @@ def test_occupancy_begins_where_points_are() -> None:
     cells = ((box.to_cube(torch.from_numpy(data.points)) + 1) * 16).long().clamp(0, 31)
     assert occupancy.grids[0][0][tuple(cells.T)].double().mean() > 0.97
     assert occupancy.grids[0].double().mean() < 1
+
+
+def test_points_that_are_not_finite_are_as_if_they_were_not_there() -> None:
+    data = make_training_set(1)
+    more = np.concatenate((data.points, np.full((1, 3), np.nan, np.float32)))
+    one, two = begun("clnerf", data), begun("clnerf", replace(data, points=more))
+    assert one.box == two.box
+    assert torch.equal(one.occupancy.grids[0], two.occupancy.grids[0])
+    assert go_on(one, 0, 2) == go_on(two, 0, 2)
 
 
 def test_a_far_place_is_rendered_behind_the_box() -> None:

@@ -1,11 +1,14 @@
 """Method specs are found by name, and configs are built from presets and typed overrides."""
 
+import math
 import subprocess
 import sys
 from dataclasses import dataclass, replace
 
 import pytest
+from installed import install
 
+from chronoscene.anchors.config import AnchorConfig
 from chronoscene.errors import ConfigError
 from chronoscene.methods import MethodSpec, build_config, load_spec, method_names
 
@@ -60,6 +63,15 @@ def test_values_of_another_type_are_refused(value):
         build_config(SPEC, preset="fast", overrides={"iterations": value})
 
 
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity", math.inf])
+def test_numbers_that_no_file_can_hold_are_refused(value):
+    """Else the model of a whole training could not be stored."""
+    with pytest.raises(ConfigError, match="toy --set rate: expected a finite number, found"):
+        build_config(SPEC, preset="fast", overrides={"rate": value})
+    with pytest.raises(ConfigError, match="offset_lr: expected a finite number, found inf"):
+        AnchorConfig(offset_lr=(math.inf, 1.0))
+
+
 @dataclass(frozen=True)
 class Unreadable:
     iterations: "Sequence[int]" = ()  # noqa: F821
@@ -85,6 +97,23 @@ def test_unknown_method_names_the_known_ones():
         load_spec("no.such.module:SPEC")
     with pytest.raises(ConfigError, match="expected a MethodSpec"):
         load_spec("json:dumps")
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'"),
+        ("OTHER = 1", "AttributeError: "),
+        ("spec = no_such_name", "NameError: "),
+    ],
+)
+def test_an_installed_method_that_cannot_be_imported_is_named(monkeypatch, tmp_path, source, found):
+    module = f"plug_in_of_{tmp_path.name}"
+    entries = {"broken": f"{module}:SPEC"}
+    install(monkeypatch, tmp_path, {module: source}, "chronoscene.methods", entries)
+    with pytest.raises(ConfigError, match=r"method broken: .* package plug-in names") as error:
+        load_spec("broken")
+    assert f"found {found}" in str(error.value)
 
 
 def test_listing_methods_imports_nothing_heavy():
