@@ -100,7 +100,7 @@ COMMANDS = {
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 """Settings of all commands."""
 
-INTERRUPTED = 130  # Exit status after Ctrl-C or SIGTERM, as in a shell
+INTERRUPTED = 130  # Exit status after Ctrl-C, as in a shell
 
 USAGE_ERROR = 2  # Exit status for wrong usage and for input that cannot be read at all
 

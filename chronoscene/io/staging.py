@@ -207,6 +207,34 @@ def check_not_current(out: Path) -> None:
         )
 
 
+@contextmanager
+def alone_in(folder: Path, option: str) -> Iterator[None]:
+    """Keep other commands that do the same out of a folder while the block runs.
+
+    The system frees the lock of a process that is killed.
+
+    Args:
+        folder: It must exist, and gets a file ``.lock``.
+        option: Option or argument by which the user gave the folder.
+
+    Raises:
+        ConfigError: If another command works in it.
+    """
+    from filelock import FileLock, Timeout
+
+    try:
+        lock = FileLock(folder / ".lock").acquire(blocking=False)
+    except Timeout as error:
+        raise ConfigError(
+            f"{option} {folder}",
+            expected="a folder in which no other command works",
+            found="one that is at work",
+            todo="wait for it, or choose another folder",
+        ) from error
+    with lock:
+        yield
+
+
 def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> None:
     """Refuse to write into the folder of a scene, or into folders that it links to.
 

@@ -8,7 +8,13 @@ from pathlib import Path
 
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.harness.plan.stop import parse_duration
-from chronoscene.io.staging import check_not_current, check_outside, sha256_of, write_text_atomic
+from chronoscene.io.staging import (
+    alone_in,
+    check_not_current,
+    check_outside,
+    sha256_of,
+    write_text_atomic,
+)
 from chronoscene.io.wording import format_time
 from chronoscene.methods import build_config, is_preset_file, load_spec
 from chronoscene.registration.photos.captures import find_captures
@@ -72,9 +78,15 @@ def run_steps(project: Project) -> Path:
         The summary page.
 
     Raises:
+        ConfigError: If another command works in the folder.
         ChronoSceneError: If a step fails.
     """
     project.out.mkdir(parents=True, exist_ok=True)
+    with alone_in(project.out, "OUT"):
+        return _run_missing(project)
+
+
+def _run_missing(project: Project) -> Path:
     page = _write(project)
     for number, step in enumerate(STEPS, 1):
         label = f"[{number}/{len(STEPS)}] {step.name}"

@@ -75,7 +75,10 @@ class Project:
 
     @property
     def scene(self) -> Path:
-        """Folder of the registered scene."""
+        """Folder of the registered scene, which keeps its name if that of all steps changes."""
+        made = self.record.steps.get("register")
+        if made is not None and made.results:
+            return self.out / "register" / Path(made.results[0]).parts[1]
         return self.out / "register" / self.out.resolve().name
 
     @property

@@ -51,6 +51,12 @@ def test_an_interruption_is_recorded(fake, monkeypatch):
     assert "stopped before its end" in fake.html
 
 
+def test_another_command_in_the_same_folder_is_refused(fake, monkeypatch):
+    monkeypatch.setattr(fake, "bench", lambda project: fake.go(), raising=False)
+    with pytest.raises(ConfigError, match=r"OUT .*: expected a folder in which no other command"):
+        fake.go()
+
+
 def test_another_option_renews_what_follows_from_it(fake):
     fake.go()
     said = fake.go(budget="5m")
@@ -95,6 +101,18 @@ def test_masks_and_the_table_are_inputs(fake):
     (fake.root / "masks/2016").mkdir(parents=True)
     (fake.root / "masks/2016/1.jpg.png").touch()
     assert fake.go()[0].startswith("changed: 1 file added; ")
+
+
+def test_the_folder_may_be_renamed(fake, monkeypatch):
+    fake.go()
+    fake.out.rename(fake.root / "site")
+    monkeypatch.setattr(type(fake), "out", fake.root / "site")
+    assert fake.go()[0] == "" and fake.calls == ["survey"]
+    assert "<title>site" in fake.html and "PSNR" in fake.html
+    (fake.photos / "2016/2.jpg").unlink()
+    fake.poses = "second"
+    fake.go()
+    assert fake.calls == NAMES and (fake.out / "register/site/registration.json").is_file()
 
 
 def test_old_results_are_not_shown_beside_new_ones(fake):

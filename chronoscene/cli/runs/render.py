@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE, STAGE
+from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE, STAGE, refuse_options
 from chronoscene.cli.output import check_file, check_place, report_written
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -142,10 +142,13 @@ def command(
             todo="choose one of them",
         )
     else:
+        refuse_options(("fps",), "for a folder of pictures")
         check_place("--out", out)
     periods = () if period is None else run.parse_periods(period)
     appearance = None if appearance_period is None else run.parse_period(appearance_period)
     found = find_viewpoints(cameras, run, scene, frames, OrbitShape(size, radius, height))
+    if cameras != "orbit" and (found.is_path or len(periods) < 2):
+        refuse_options(("frames",), "where cameras and periods give the number of pictures")
     viewpoints = with_periods(found, run, periods, frames)
     check_viewpoints(run, viewpoints, out, appearance)
     images = render_viewpoints(run, viewpoints, appearance_period=appearance)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, PATH, PLUGIN, SCENE, reading_options
+from chronoscene.cli.options import DEVICE, PATH, PLUGIN, SCENE, reading_options, refuse_options
 from chronoscene.cli.output import say
 from chronoscene.cli.progress import announce
 from chronoscene.cli.scenes.reading import read_and_note
@@ -51,6 +51,7 @@ def command(
     keep_freed_memory()  # arrays as large as those of the picture before
     chosen = choose_port(host, port)
     if any((folder / RUN_FILE).is_file() for folder in folders):
+        refuse_options(("dataset_format", "period_by"), "with runs")
         runs = [open_run(folder, device=device, plugin=plugin) for folder in folders]
         check_runs(runs)
         announce("open the models")
@@ -67,6 +68,7 @@ def command(
             todo="view one scene at a time",
         )
     else:
+        refuse_options(("scene", "plugin", "device"), "without a run")
         found = read_and_note(folders[0], dataset_format, period_by)
         content = Content(found, summary=certificate_summary(folders[0]))
     server = ViewServer(content, host, chosen)

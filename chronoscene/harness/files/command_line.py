@@ -7,6 +7,9 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from chronoscene.methods import installed_methods, load_spec
+from chronoscene.methods.preset_files import SUFFIX
+
 OPTIONS = ("iterations", "budget", "separate_iterations", "max_width", "protocol")
 """Names in a variant that are options of ``bench``, not of the method."""
 FLAGS = ("validation", "fit_half")
@@ -23,8 +26,9 @@ def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None)
         seed: None leaves the option out.
     """
     words = ["chronoscene", "bench", scene]
-    for name in ("method", "strategy", "preset"):
+    for name in ("method", "strategy"):
         words += [f"--{name}", config[name]]
+    words += ["--preset", _preset(config["method"], config["preset"])]
     words += [] if seed is None else ["--seed", str(seed)]
     compress: list[str] = []
     # A comma inside of a value is followed by no name.
@@ -42,3 +46,9 @@ def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None)
         else:
             words += ["--set", assignment]
     return " && ".join(map(shlex.join, filter(None, (words, compress))))
+
+
+def _preset(method: str, name: str) -> str:
+    """Return the name of a preset, or of its file if the method has none of this name."""
+    is_known = method not in installed_methods() or name in load_spec(method).presets
+    return name if is_known else f"{name}{SUFFIX}"

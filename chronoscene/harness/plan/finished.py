@@ -9,6 +9,7 @@ from typing import Any
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files import records
+from chronoscene.harness.files.source import read_source
 from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun
 
 
@@ -16,21 +17,31 @@ def is_finished(run: ResolvedRun, overwrite: bool = False) -> bool:
     """Return True if the result is there, made with the same settings from the same scene.
 
     Raises:
-        ConfigError: If there is one made with other settings, unless it may be replaced.
+        ConfigError: If there is one made with other settings, or by another method of the same
+            name, unless it may be replaced.
     """
-    if not (run.job.folder / records.RUN_FILE).is_file():
+    folder, method = run.job.folder, run.job.origin.method
+    if not (folder / records.RUN_FILE).is_file():
         return False
-    return _matches(run, run.job.folder, "a finished", overwrite)
+    if not _matches(run, folder, "a finished", overwrite):
+        return False
+    # Runs of earlier versions do not say where their method is.
+    made_by = read_source(folder).method if (folder / records.SOURCE_FILE).is_file() else method
+    if made_by != method and not overwrite:
+        raise _conflict(folder, f"a run of {method}", f"a finished one of {made_by}")
+    return made_by == method
 
 
 def is_obsolete(run: ResolvedRun, overwrite: bool = False) -> bool:
     """Return True for checkpoints of a training with other settings, which may be deleted.
 
+    So may those whose settings are missing, as their deletion was interrupted.
+
     Raises:
         ConfigError: If there are such, and they may not be deleted.
     """
     if not (run.job.training / records.CONFIG_FILE).is_file():
-        return False
+        return run.job.training.is_dir()
     return not _matches(run, run.job.training, "an unfinished", overwrite)
 
 
@@ -54,12 +65,12 @@ def _matches(run: ResolvedRun, folder: Path, kind: str, overwrite: bool) -> bool
     if stored == run.document or overwrite:
         return bool(stored == run.document)
     old, new = first_difference(stored, run.document)
-    raise ConfigError(
-        folder,
-        expected=f"a run with {new}",
-        found=f"{kind} one with {old}",
-        todo="choose another folder with --out, or pass --overwrite",
-    )
+    raise _conflict(folder, f"a run with {new}", f"{kind} one with {old}")
+
+
+def _conflict(folder: Path, expected: str, found: str) -> ConfigError:
+    todo = "choose another folder with --out, or pass --overwrite"
+    return ConfigError(folder, expected=expected, found=found, todo=todo)
 
 
 def first_difference(old: Any, new: Any, key: str = "settings") -> tuple[str, str]:
@@ -100,7 +111,7 @@ def continued(run: ResolvedRun, method: ResolvedMethod, iterations: int) -> Reso
             last.job.folder,
             expected="a run that kept its training",
             found="its model alone",
-            todo="train anew with --keep-training; such a run can be trained further",
+            todo="delete that folder and train anew with --keep-training",
         )
     job = replace(
         run.job.with_settings(iterations=iterations),

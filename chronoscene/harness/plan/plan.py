@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from itertools import chain, product
 from pathlib import Path
 
+from chronoscene.errors import ConfigError
 from chronoscene.harness.files.ground_truth import freeze_ground_truth
+from chronoscene.harness.files.records import TRAINING
 from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.checks import check_run
@@ -37,6 +39,8 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     """Resolve and check all runs asked for; freezes the ground truth of the scenes."""
     shared = settings.run
     methods = resolve_methods(settings.methods, shared)
+    if shared.separate_iterations is not None:
+        _check_sharing(settings, methods)
     if settings.ray is None:  # else the machine that runs a job checks its own
         gsplat = any(method.spec.draws_gaussians for method in methods)
         check_device(shared.device, gsplat=gsplat)
@@ -45,6 +49,10 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     for scene in read_scenes(settings, log):
         asked = {run.job.folder: run for run in _runs_of_scene(settings, scene, methods)}
         missing = {k: run for k, run in asked.items() if is_to_do(run, settings.overwrite)}
+        for folder, run in asked.items() if shared.keep_training else ():
+            kept = (folder / TRAINING).is_dir() or run.job.training.is_dir()
+            if folder not in missing and not kept:
+                log(f"note: {folder} has its model alone: delete it to keep a training there")
         if trained := [run for run in missing.values() if run.spec.runner is None]:
             views = max(views_at_a_time(run.config, shared.threads) for run in trained)
             here = settings.ray is None
@@ -60,6 +68,22 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     for notice in dict.fromkeys(chain(*(run.job.notices for run in runs.values()))):
         log(f"note: {notice}")
     return Plan(runs, todo)
+
+
+def _check_sharing(settings: BenchSettings, methods: list[ResolvedMethod]) -> None:
+    """Refuse a way of sharing iterations where no run has any.
+
+    Raises:
+        ConfigError: If that is so.
+    """
+    asked = [(m, s) for m in methods for s in settings.strategies or (m.spec.strategy,)]
+    if not any(method.has_sharing(strategy) for method, strategy in asked):
+        raise ConfigError(
+            "--separate-iterations",
+            expected="strategy separate or sequential, or a preset with iterations per period",
+            found=", ".join(dict.fromkeys(strategy for _, strategy in asked)),
+            todo="leave it out, or use --iterations",
+        )
 
 
 def _runs_of_scene(

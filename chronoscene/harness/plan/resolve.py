@@ -24,6 +24,7 @@ from chronoscene.methods import (
     build_config,
     load_spec,
 )
+from chronoscene.methods.preset_files import find_preset
 
 _NEUTRAL = {"views_per_step": 1}
 
@@ -43,15 +44,18 @@ class ResolvedMethod:
 
     def sharing(self, strategy: str) -> str:
         """Return how the models or stages of a strategy share iterations, one of `SHARING`."""
-        kind, own = STRATEGIES[strategy], self._own_sharing
-        if own == "total" and not (kind.model_per_period or kind.in_order):
-            return own
-        return self.settings.separate_iterations or own
+        asked = self.settings.separate_iterations if self.has_sharing(strategy) else None
+        return asked or self._own_sharing
+
+    def has_sharing(self, strategy: str) -> bool:
+        """Return True if a strategy has models or stages, or iterations of each period."""
+        kind = STRATEGIES[strategy]
+        return kind.model_per_period or kind.in_order or self._own_sharing == "each"
 
     @property
     def _own_sharing(self) -> str:
-        """Return that of the preset."""
-        return SHARING[self.settings.preset in self.spec.per_period]
+        """Return that of the preset, or of the one that a preset file starts from."""
+        return SHARING[find_preset(self.settings.preset, self.spec).base in self.spec.per_period]
 
     def run(self, job: Job) -> ResolvedRun:
         """Resolve a run of this method; its job gets its variant.
@@ -152,11 +156,25 @@ def resolve_methods(references: Sequence[str], settings: RunSettings) -> list[Re
     """Build the configurations of several methods for all runs of a bench.
 
     Raises:
-        ConfigError: If a method does not exist, or as `check_overrides` and `resolve_method`.
+        ConfigError: If a method does not exist, two have one name, or as `check_overrides` and
+            `resolve_method`.
     """
     specs = [load_spec(reference) for reference in references]
+    named: dict[str, str] = {}
+    for reference, spec in zip(references, specs, strict=True):
+        if (other := named.setdefault(spec.name, reference)) != reference:
+            raise _same_name(reference, spec.name, f"that of {other}, too")
     check_overrides(settings.overrides, [spec.name for spec in specs])
     return [resolve_method(*pair, settings) for pair in zip(references, specs, strict=True)]
+
+
+def _same_name(reference: str, name: str, found: str) -> ConfigError:
+    return ConfigError(
+        f"--method {reference}",
+        expected="a method with a name of its own",
+        found=f"{name!r}, {found}",
+        todo="change the name in its MethodSpec, or run it with another --out",
+    )
 
 
 def check_overrides(overrides: Mapping[str, str], names: Sequence[str]) -> None:

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Protocol
 
 from chronoscene.harness.files import records
@@ -66,7 +67,7 @@ class LocalPool:
         self.at_once = jobs
         self.stop = Stop()
         self._threads = max(1, available_threads() // jobs)
-        self._taken: dict[str, int] = {}
+        self._taken: dict[Path, int] = {}
         self._changed = threading.Condition()
 
     def run(self, job: Job, report: Report) -> records.Failure | None:
@@ -88,12 +89,12 @@ class LocalPool:
                 reported = True
                 self._changed.wait(PATIENCE)
                 self.stop.check()
-            self._taken[job.label] = job.memory
+            self._taken[job.folder] = job.memory
         try:
             yield
         finally:
             with self._changed:
-                del self._taken[job.label]
+                del self._taken[job.folder]
                 self._changed.notify_all()
 
     def _free(self) -> int:

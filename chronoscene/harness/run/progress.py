@@ -24,7 +24,7 @@ class RunsDisplay:
     def __init__(self, total: int, log: Log, console: Console | None = None) -> None:
         self._total, self._ended = total, 0
         self._log = log
-        self._shares: dict[str, float] = {}
+        self._shares: dict[object, float] = {}
         self._began = time.monotonic()
         self._lock = threading.Lock()
         console = console or Console(stderr=True)
@@ -54,22 +54,23 @@ class RunsDisplay:
             self._log(line)
 
     @contextmanager
-    def showing(self, label: str) -> Iterator[Report]:
+    def showing(self) -> Iterator[Report]:
         """A function that takes the progress of a run; it has ended when the block does."""
+        run = object()
         with self._lock:
-            self._shares[label] = 0.0
+            self._shares[run] = 0.0
         self._show()
-        yield partial(self._update, label)
+        yield partial(self._update, run)
         with self._lock:  # an error ends the display, too
-            del self._shares[label]
+            del self._shares[run]
             self._ended += 1
         self._show(plain=True)
 
-    def _update(self, label: str, what: str, done: int, total: int) -> None:
+    def _update(self, run: object, what: str, done: int, total: int) -> None:
         if not total:
             self.log(what)
             return
-        self._shares[label] = done / total
+        self._shares[run] = done / total
         self._show()
 
     def _show(self, *, plain: bool = False) -> None:

@@ -126,7 +126,7 @@ def _run_in_pool(
     with RunsDisplay(len(todo), log) as display, ThreadPoolExecutor(pool.at_once) as threads:
 
         def locked(run: ResolvedRun, lock: Lock) -> None:
-            with lock, display.showing(run.job.label) as report:
+            with lock, display.showing() as report:
                 carry_out(run, partial(pool.run, report=report), display.log)
 
         try:

@@ -99,7 +99,7 @@ def write_report(
     start = dataclasses.asdict(build_config(spec, preset=base))
     found = dataclasses.asdict(method.config) | best.options
     if method.settings.iterations is not None:  # of the search, not of what was found
-        del found["iterations"]
+        found["iterations"] = method.preset["iterations"]
     file = PresetFile(
         method=spec.name,
         base=base,

@@ -7,17 +7,17 @@ import math
 import shutil
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 from chronoscene.checks import import_extra
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files import records
+from chronoscene.harness.files.predictions import MANIFEST
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.source import read_bench_scene
 from chronoscene.harness.plan.finished import first_difference
@@ -30,6 +30,7 @@ from chronoscene.harness.run.progress import RunsDisplay
 from chronoscene.harness.run.runner import BenchOutcome, Execute, run_plan
 from chronoscene.harness.tune.report import TrialResult, best_of, read_results, write_report
 from chronoscene.io.log import Log
+from chronoscene.io.staging import alone_in
 from chronoscene.methods import as_typed, load_spec
 from chronoscene.methods.search_space import draw, starting_point
 
@@ -98,7 +99,7 @@ def tune(
     """
     out = settings.run.runs
     out.mkdir(parents=True, exist_ok=True)
-    with _alone(out):
+    with alone_in(out, "--out"):
         search = _open(settings, out, log)
         missing = trials - sum(trial.state.is_finished() for trial in search.study.trials)
         if missing > 0:
@@ -112,20 +113,6 @@ def tune(
             todo="correct that, and choose another folder with --out",
         )
     return results
-
-
-@contextmanager
-def _alone(out: Path) -> Iterator[None]:
-    try:
-        with FileLock(out / ".lock").acquire(blocking=False):
-            yield
-    except Timeout as error:
-        raise ConfigError(
-            f"--out {out}",
-            expected="a folder that no other command searches in",
-            found="one that is at work",
-            todo="wait for it, or choose another folder",
-        ) from error
 
 
 def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
@@ -184,7 +171,7 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
 def _run_trials(
     search: _Search, trials: int, missing: int, log: Log, execute: Execute | None
 ) -> None:
-    queue = _queue(search, trials)
+    queue = islice(_queue(search, trials), missing)  # more may be left if several ran at a time
     under_way: dict[Future[BenchOutcome], Trial] = {}
     with open_pool(search.settings) as opened:
         pool = opened or LocalPool(1)
@@ -236,7 +223,7 @@ def _run(
     """Run the scenes of a trial, in a thread of its own."""
 
     def in_pool(job: Job) -> records.Failure | None:
-        with display.showing(job.label) as report:
+        with display.showing() as report:
             return pool.run(job, report)
 
     return run_plan(plan, settings, _silent, execute=execute or in_pool)
@@ -247,9 +234,10 @@ def _finish(search: _Search, trial: Trial, outcome: BenchOutcome, log: Log) -> N
     from optuna.trial import TrialState
 
     runs = [records.read_run(folder) for folder in outcome.finished]
-    values = [run.aggregates["macro"]["psnr"] for run in runs]
+    values = [run.aggregates["macro"].get("psnr", math.nan) for run in runs]
     value = sum(values) / len(values) if values else math.nan
-    reason = "; ".join(failure.reason for failure in outcome.failures)
+    unscored = [f"{run.scene}: {run.skipped['psnr']}" for run in runs if "psnr" in run.skipped]
+    reason = "; ".join([*(failure.reason for failure in outcome.failures), *unscored])
     if not reason and not math.isfinite(value):
         reason = f"PSNR is {value}"
     for name, found in (
@@ -270,6 +258,10 @@ def _finish(search: _Search, trial: Trial, outcome: BenchOutcome, log: Log) -> N
     folder = search.out / TRIALS / f"{trial.number:03d}"
     parts = (records.CHECKPOINT, records.PREDICTIONS, records.STAGES)
     bulky = [path for part in parts for path in folder.glob(f"*/*/seed*/{part}")]
-    for path in (folder / records.GROUND_TRUTH, folder / records.PHOTOS, *bulky):
+    # Scenes may have the names of these two folders.
+    bulky += [path.parent for path in folder.glob(f"{records.GROUND_TRUTH}/*/{MANIFEST}")]
+    for path in bulky:
         shutil.rmtree(path, ignore_errors=True)
+    for path in folder.glob(f"{records.PHOTOS}/*.npz"):
+        path.unlink(missing_ok=True)
     search.results()

@@ -163,12 +163,17 @@ def with_periods(
 
 
 def _range(run: TrainedRun, periods: tuple[float, ...], count: int) -> Iterable[float]:
-    """Return periods from the first to the last; whole ones if nothing is between."""
+    """Return periods from the first to the last; whole ones if nothing is between.
+
+    Each whole one has an equal share, or, of too few pictures, the first and the last have one.
+    """
     start, end = periods[0], periods[-1]
     if run.is_continuous:
         return np.linspace(start, end, count).tolist()
     step = 1 if end >= start else -1
     whole = np.arange(start, end + step, step)
+    if count < len(whole):
+        return whole[np.linspace(0, len(whole) - 1, count).round().astype(int)].tolist()
     return whole[np.arange(count) * len(whole) // count].tolist()
 
 

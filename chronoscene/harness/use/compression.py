@@ -34,6 +34,7 @@ from chronoscene.harness.files.records import (
     CHECKPOINT,
     CONFIG_FILE,
     PREDICTIONS,
+    RUN_FILE,
     SOURCE_FILE,
     read_config,
     size_of,
@@ -94,9 +95,10 @@ class _SortedModel:
     def rounded(self, rules: Mapping[str, Columns]) -> Arrays:
         """Return the tensors as the compressed file gives them back."""
         tensors = dict(self.tensors)
-        for name in tensors.keys() - self.grids.keys():
-            tensor = tensors[name]
-            if name in rules:
+        for name, tensor in self.tensors.items():
+            if name in self.grids:
+                tensors[name] = self.grids[name].positions(self.grids[name].codes(tensor))
+            elif name in rules:
                 codes = rules[name].codes(_rows(tensor))
                 tensors[name] = rules[name].restore(codes).reshape(tensor.shape)
             elif tensor.dtype == np.float32:
@@ -127,7 +129,8 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
         The folder of the new run.
 
     Raises:
-        ConfigError: If the run has stages, or the method has no anchors or Gaussians.
+        ConfigError: If the run has stages or is a compressed one, there is one like this already,
+            or the method has no anchors or Gaussians.
         SceneError: If the folder of the new run is in use.
     """
     if run.strategy.in_order:
@@ -137,11 +140,25 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
             found=f"strategy {run.record.strategy}",
             todo="compress a run under another strategy",
         )
+    if any(part.startswith("compressed=") for part in run.record.variant.split(",")):
+        raise ConfigError(
+            run.folder,
+            expected="a run as it was trained",
+            found="a compressed one, whose losses would add up",
+            todo="compress the run that it was made from",
+        )
     store = ImageStore(scene, max_width=run.record.max_width)
     label = "plain" if max_loss is None else f"{max_loss:g}dB"
     variant = ",".join(filter(None, (run.record.variant, f"compressed={label}")))
     out = run.folder.resolve()
     out = out.parents[1] / f"{out.parent.name},compressed={label}" / out.name
+    if (out / RUN_FILE).exists():
+        raise ConfigError(
+            out,
+            expected="no run that is compressed like this",
+            found="one",
+            todo="use it, or delete it to compress the run again",
+        )
     with staged_folder(out) as staged:
         for number in range(run.num_periods) if run.strategy.model_per_period else (None,):
             part = "" if number is None else period_part(number)
@@ -228,8 +245,8 @@ def _fit(model: _SortedModel, max_loss: float, log: Log) -> dict[str, Columns]:
             raise ConfigError(
                 f"--max-loss {max_loss:g}",
                 expected="a loss that rounding can keep to",
-                found="a larger one with half floats alone",
-                todo="allow more",
+                found="a larger one with half floats and positions on a grid alone",
+                todo="allow more, or use --plain",
             )
     for _ in range(ROUNDS):
         middle = (low + high) / 2

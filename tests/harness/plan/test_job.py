@@ -161,6 +161,13 @@ def test_the_command_names_what_differs_from_the_preset():
     assert command_line("DIR", config, 0).endswith("--seed 0 --set sh_degree=2 --budget 90s")
 
 
+def test_the_command_names_the_file_of_a_preset_that_the_method_lacks():
+    for method, preset in (("3dgs", "mine.toml"), ("3dgs", "fast"), ("not-installed", "mine")):
+        name = preset.removesuffix(".toml")
+        config = {"method": method, "strategy": "joint", "preset": name, "variant": ""}
+        assert command_line("DIR", config).endswith(f"--preset {preset}")
+
+
 @pytest.mark.parametrize(
     ("label", "option"),
     [("0.1dB", "--max-loss 0.1"), ("1e-05dB", "--max-loss 1e-05"), ("plain", "--plain")],

@@ -95,6 +95,16 @@ def test_runs_begin_when_their_memory_is_free(run_pool):
     ]
 
 
+def test_equal_runs_of_two_folders_go_on_side_by_side(monkeypatch):
+    """As of two trials of a search that have drawn the same."""
+    both = threading.Barrier(2, timeout=60)
+    monkeypatch.setattr(local_pool, "run_in_process", lambda job, **options: both.wait())
+    local = local_pool.LocalPool(2)
+    jobs = [JOB.with_settings(runs=Path(name)) for name in ("/one", "/two")]
+    with ThreadPoolExecutor(2) as threads:
+        assert sorted(threads.map(lambda job: local.run(job, print), jobs)) == [0, 1]
+
+
 def test_a_run_that_is_alone_begins_without_memory(run_pool):
     most, seen, _ = run_pool(10**12, 10**6)
     assert most == 1 and len(seen) == 2

@@ -80,7 +80,7 @@ def test_several_runs_have_one_bar(live):
     buffer, said = io.StringIO(), []
     console = Console(file=buffer, force_terminal=live, width=100, color_system=None)
     display = RunsDisplay(4, said.append, console)
-    with display, display.showing("a") as report, display.showing("b") as other:
+    with display, display.showing() as report, display.showing() as other:
         report("iteration 5", 500, 1000)
         other("b: a note [x]", 0, 0)
         display._bar.refresh()

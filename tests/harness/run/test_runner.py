@@ -20,6 +20,7 @@ from chronoscene.harness.report.tables import format_runs
 from chronoscene.harness.run import runner
 from chronoscene.harness.score.scoring import rescore
 from chronoscene.harness.use.trained_run import open_run
+from chronoscene.methods import load_spec
 from chronoscene.metrics.registry import make_scorers
 
 FIELDS = {
@@ -293,6 +294,13 @@ def test_separate_models_and_stages_share_or_repeat(bench_here, strategy):
     assert any(line.endswith("has all iterations and time") for line in said)
 
 
+def test_a_preset_file_means_its_iterations_as_the_preset_that_it_starts_from(bench_here, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('method = "dated"\nbase = "balanced"\n[options]\niterations = 9\n')
+    own, _ = bench_here("DATED", strategies=("separate",), preset=str(file))
+    assert read_run(own.finished[0]).iterations == 18 and read_run(own.finished[0]).variant == ""
+
+
 def test_presets_may_mean_their_iterations_for_each_period(bench_here):
     """Two periods: 18 steps, of which each model or stage of one period does 9."""
     strategies = ("joint", "separate", "sequential", "pooled")
@@ -320,6 +328,7 @@ def test_presets_may_mean_their_iterations_for_each_period(bench_here):
         ({"strategies": ("sequential",), "methods": ("toy_methods:FIXED",)}, "without extend"),
         ({"strategies": ("sequential",), "methods": ("toy_programs:PROGRAM",)}, "without extend"),
         ({"strategies": ("sequential",), "keep_training": True}, "--keep-training, --continue-to"),
+        ({"separate_iterations": "each"}, "expected strategy separate or sequential.*found joint"),
     ],
 )
 def test_wrong_settings_end_before_anything_is_trained(bench, tmp_path, changes, message):
@@ -332,6 +341,26 @@ def test_wrong_weights_end_before_anything_is_trained(bench, tmp_path):
     (tmp_path / "w").mkdir()
     with pytest.raises(MetricUnavailableError, match="expected VGG16 and the LPIPS heads"):
         bench("MEAN", lpips_weights=tmp_path / "w")
+
+
+def test_methods_of_one_name_are_not_taken_for_each_other(bench_here, monkeypatch):
+    monkeypatch.setattr("toy_methods.COPY", load_spec("toy_methods:MEAN"), raising=False)
+    with pytest.raises(ConfigError, match=r"toy_methods:COPY: expected .*'mean', that of toy_meth"):
+        bench_here("MEAN", "COPY")
+    bench_here("MEAN")
+    with pytest.raises(ConfigError, match=r"a run of toy_methods:COPY, found a finished one of "):
+        bench_here("COPY")
+    assert bench_here("COPY", overwrite=True)[0].skipped == 0
+    assert bench_here("COPY")[0].skipped == 1
+
+
+def test_a_finished_run_that_kept_no_training_is_named(bench_here):
+    (folder,) = bench_here("MEAN")[0].finished
+    note = f"note: {folder} has its model alone: delete it to keep a training there"
+    assert note in bench_here("MEAN", keep_training=True)[1]
+    shutil.rmtree(folder)
+    assert note not in bench_here("MEAN", keep_training=True)[1]
+    assert note not in bench_here("MEAN", keep_training=True)[1]
 
 
 def test_scenes_of_one_name_are_refused(bench, scene_folder, tmp_path):

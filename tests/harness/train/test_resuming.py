@@ -157,6 +157,19 @@ def dying(*args):
     raise SystemExit
 
 
+def test_what_is_left_of_deleted_checkpoints_is_not_gone_on_from(bench_here, tmp_path, monkeypatch):
+    options = {"iterations": 20, "preset": "slow", "checkpoint_seconds": 0.0}
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "finish", dying)
+        with pytest.raises(SystemExit):
+            bench_here(TOY, **options)
+    (settings,) = tmp_path.glob("runs/ring/*/.seed0.training/config.json")
+    settings.unlink()
+    assert checkpoint_of(tmp_path / "runs")
+    bench_here(TOY, **options, device="cpu")
+    assert read_run(run_of(tmp_path / "runs")).resumed == 0
+
+
 @pytest.mark.parametrize("strategy", ["joint", "separate"])
 def test_finished_runs_are_trained_further(bench_here, tmp_path, strategy):
     whole, runs = tmp_path / "whole", tmp_path / "runs"

@@ -5,8 +5,10 @@ import shutil
 import sys
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from PIL import Image
 from training_here import execute_here
 
 from chronoscene.errors import ConfigError
@@ -81,6 +83,16 @@ def test_an_interrupted_search_goes_on_where_it_was(search, failing):
         assert untimed(search(out, 14)) == untimed(whole)
 
 
+def test_no_more_trials_than_asked_for_go_on(search):
+    def interrupted(job):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        search("out", 6, execute=interrupted, jobs=2)
+    assert [result.number for result in search("out", 1)] == [0]
+    assert [result.number for result in search("out", 3)] == [0, 1, 2]
+
+
 def test_the_first_trial_is_the_preset_and_the_best_one_becomes_a_preset(
     search, bench_here, tmp_path
 ):
@@ -121,6 +133,38 @@ def test_failed_trials_count(search):
     assert search("out") == results
     with pytest.raises(ConfigError, match=r"expected a trial with a result, found none.*too bad"):
         search("none", 2, execute=lambda job: job.failure("too bad"))
+
+
+def test_views_that_masks_ignore_have_no_score(search, scene_folder, tmp_path):
+    masked = Path(shutil.copytree(scene_folder, tmp_path / "masked"))
+    for name in ("a/0.png", "b/3.png"):  # the validation views
+        mask = masked / f"masks/{name}.png"
+        mask.parent.mkdir(parents=True)
+        Image.new("L", (24, 16)).save(mask)
+    with pytest.raises(ConfigError, match=r"ended so: masked: the masks of all test views ignore"):
+        search("out", 2, scenes=(masked,))
+    with pytest.raises(ConfigError, match=r"ended so: masked: the masks of all test views ignore"):
+        search("two", 2, scenes=(scene_folder, masked))
+
+
+@pytest.mark.parametrize("name", ["photos", "ground_truth"])
+def test_records_are_kept_whatever_the_name_of_the_scene(search, scene_folder, tmp_path, name):
+    scene = Path(shutil.copytree(scene_folder, tmp_path / name))
+    search("out", 2, scenes=(scene,), photo_memory=20_000)
+    kept = [p.name for p in (tmp_path / "out/trials").rglob("*") if p.is_file()]
+    assert kept.count("run.json") == 2
+    assert not any(part in name for name in kept for part in ("png", "npz"))
+
+
+def test_the_length_of_the_trials_is_not_that_of_what_is_found(search, tmp_path):
+    file = tmp_path / "long.toml"
+    file.write_text('method = "tuned"\nbase = "balanced"\n[options]\niterations = 33\n')
+    search("out", 2, preset=str(file), iterations=5)
+    written = tomllib.loads((tmp_path / "out/preset.toml").read_text())
+    assert written["options"]["iterations"] == 33 and written["tuning"]["iterations"] == 5
+    search("named", 2, iterations=5)
+    written = tomllib.loads((tmp_path / "named/preset.toml").read_text())
+    assert "iterations" not in written["options"]
 
 
 @pytest.mark.slow

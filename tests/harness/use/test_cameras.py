@@ -165,3 +165,9 @@ def test_each_camera_that_stands_shows_the_whole_range(run):
 def test_a_range_of_whole_periods_gives_each_an_equal_share(one_each, ends, expected):
     viewpoints = with_periods(viewpoints_of(one_each, "orbit", 4), one_each, ends, 99)
     assert [viewpoint.period for viewpoint in viewpoints] == expected
+
+
+def test_too_few_pictures_of_whole_periods_show_the_first_and_the_last(one_each):
+    viewpoints = viewpoints_of(one_each, "orbit", 2)
+    ends = (0.0, 5.0)
+    assert [v.period for v in with_periods(viewpoints, one_each, ends, 99)] == [0, 5]

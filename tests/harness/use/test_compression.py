@@ -11,6 +11,9 @@ import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import cli
+from chronoscene.compression.columns import Columns
+from chronoscene.compression.file import encode, read_compressed
+from chronoscene.compression.positions import Grid, morton
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.harness.files.predictions import load_image, read_manifest, to_bytes
 from chronoscene.harness.files.records import read_run, run_folders
@@ -86,9 +89,38 @@ def test_training_views_lose_what_is_allowed_and_hardly_less(copied, monkeypatch
     assert 0.3 < training_psnr(folder) - training_psnr(out) <= 0.5 + 1e-6
 
 
+def test_the_loss_is_that_of_the_file_though_a_position_is_far_away(tmp_path):
+    pytest.importorskip("constriction", reason="coded models need constriction")
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=(300, 3)).astype(np.float32)
+    means[0] = 0, 0, 1e5
+    grid = Grid.of(means, None)
+    means = means[np.argsort(morton(grid.codes(means)))]
+    values = rng.normal(size=(300, 4)).astype(np.float32)
+    tensors, rules = {"means": means, "values": values}, {"values": Columns.of(values)}
+    (tmp_path / "model").write_bytes(encode(tensors, {"means": grid}, rules))
+    stored = read_compressed(tmp_path / "model")
+    model = compression._SortedModel(None, (), None, None, tmp_path, tensors, {"means": grid})
+    rounded = model.rounded(rules)
+    for name in tensors:
+        np.testing.assert_array_equal(rounded[name], stored[name])
+    assert np.abs(stored["means"] - means).max() > 0.01
+
+
 def test_a_loss_means_nothing_to_the_plain_form(trained):
     with pytest.raises(ConfigError, match="--max-loss: expected no --plain"):
         compress(trained["chronogs"], "--plain", "--max-loss", "0.5")
+
+
+def test_a_run_is_compressed_once(copied):
+    folder = copied("chronogs")
+    out, _ = compress(folder, "--plain")
+    for place, expected in (
+        (folder, "expected no run that is compressed like this, found one; use it, or delete it"),
+        (out, "expected a run as it was trained, found a compressed one"),
+    ):
+        result = CliRunner().invoke(cli, ["compress", str(place), "--plain"])
+        assert expected in str(result.exception)
 
 
 def test_a_damaged_model_is_refused(copied):

@@ -54,8 +54,9 @@ def test_an_orbit_of_another_size_and_shape(trained, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["chronogs", "3dgs-period"])
-def test_the_geometry_of_a_period_in_the_light_of_another(trained, name):
-    run = open_run(trained[name])
+def test_the_geometry_of_a_period_in_the_light_of_another(bench_here, name):
+    outcome, _ = bench_here(name, preset="fast", iterations=60)  # long enough to tell two lights
+    run = open_run(outcome.finished[0])
     frame = run.scene().frames[0]
     shown = {
         (p, q): run.render(frame.camera, frame.cam_from_world, p, appearance_period=q)
@@ -83,6 +84,8 @@ def test_methods_without_geometry_of_their_own_refuse_another_light(runs, traine
         (("--period", "0:0.5"), "period 0.5: expected a whole number: 4DGS under strategy sep"),
         (("--cameras", "orbit"), "--period: expected a period"),
         (("--radius", 3), "--size, --radius, --height: expected --cameras orbit"),
+        (("--frames", 5), "--frames: expected none where cameras and periods give the number"),
+        (("--fps", 5), "--fps: expected none for a folder of pictures"),
     ],
 )
 def test_what_a_run_cannot_show(trained, tmp_path, options, message):

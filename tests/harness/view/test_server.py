@@ -297,6 +297,16 @@ def test_without_viser(trained, monkeypatch):
     assert "pip install 'chronoscene[view]'" in str(result.exception)
 
 
+def test_options_without_effect_are_refused(trained, scene_folder):
+    for arguments, message in (
+        ((trained["chronogs"], "--period-by", "year"), "--period-by: expected none with runs"),
+        ((scene_folder, "--device", "cpu"), "--device: expected none without a run"),
+        ((scene_folder, "--scene", scene_folder), "--scene: expected none without a run"),
+    ):
+        result = CliRunner().invoke(cli, ["view", *map(str, arguments)])
+        assert message in str(result.exception)
+
+
 def test_several_scenes_are_refused(scene_folder):
     result = CliRunner().invoke(cli, ["view", str(scene_folder), str(scene_folder)])
     assert "expected one scene, or runs only" in str(result.exception)
