@@ -15,6 +15,7 @@ A method that splats Gaussians need not implement all of `Method`: `GaussianMeth
 from __future__ import annotations
 
 from chronoscene.methods.interface import (
+    POSITIONS,
     Method,
     MethodSize,
     PeriodSharing,
@@ -46,6 +47,7 @@ from chronoscene.methods.spec import (
 )
 
 __all__ = [
+    "POSITIONS",
     "PROGRAM_GROUP",
     "Method",
     "MethodConfig",

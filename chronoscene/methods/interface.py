@@ -16,6 +16,8 @@ from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.similarity import Sim3
 
 Skipped = Literal["empty", "not finite"]
+POSITIONS = ("anchors", "means")
+"""Names of the tensor of positions in a stored model that is a set of anchors or Gaussians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -276,8 +278,8 @@ class Method(Protocol):
     def permute(self, order: NDArray[np.int64]) -> None:
         """Put the anchors or Gaussians of a loaded model into another order. [N]
 
-        Only where the model is a set of these, whose positions are the tensor ``anchors`` or
-        ``means``; a method without it has no such function.
+        Only where the model is a set of these, whose positions are one of the tensors `POSITIONS`;
+        a method without it has no such function.
         """
 
     def save_training(self, folder: Path) -> None:

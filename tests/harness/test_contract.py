@@ -2,6 +2,7 @@
 
 import pytest
 
+from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.harness import contract
 from chronoscene.harness.contract import CHECKS, check_method
 from chronoscene.harness.train.checks import MethodError
@@ -64,6 +65,18 @@ def test_gaussians_of_another_period_are_found(problems):
         "to_gaussians of periods 0 and 1: expected what changes in render, found 100% of"
     )
     assert problems("MEAN", "gaussians_look_like_the_model") == [None]
+
+
+def test_a_part_of_the_model_that_keeps_its_order_is_found(monkeypatch):
+    def permute(self, order):
+        parameters = self.model.parameters
+        self.model.parameters = {**parameters, "means": parameters["means"][order.tolist()]}
+
+    chosen = [check for check in CHECKS if check.__name__ == "another_order_shows_the_same"]
+    assert [result.problem for result in check_method("3dgs", chosen)] == [None]
+    monkeypatch.setattr(GaussianMethod, "permute", permute)
+    (result,) = check_method("3dgs", chosen)
+    assert result.problem.startswith("permute, period 0: expected nearly equal pixels, found ")
 
 
 class _Folder:

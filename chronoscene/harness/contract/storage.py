@@ -14,6 +14,7 @@ import numpy as np
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.contract.subject import (
     PAUSE,
+    NotApplicableError,
     Subject,
     contents,
     demand,
@@ -22,6 +23,10 @@ from chronoscene.harness.contract.subject import (
     tensors_of,
 )
 from chronoscene.harness.train.checks import check_size, refuse
+from chronoscene.methods import POSITIONS
+
+_ROUNDING = 1e-3
+"""Largest difference of a pixel, as Gaussians at one depth may be drawn in another order."""
 
 
 def a_model_is_two_files(subject: Subject) -> None:
@@ -79,6 +84,22 @@ def a_loaded_model_is_the_same(subject: Subject) -> None:
     sizes = subject.method.size(), loaded.size()
     demand(sizes[0] == sizes[1], "size after load", str(sizes[0]), sizes[1])
     same_files(subject.save(loaded), subject.model, "save after load", "equal bytes")
+
+
+def another_order_shows_the_same(subject: Subject) -> None:
+    """A model whose anchors or Gaussians are put into another order is saved and shows the same."""
+    sorted_model = subject.loaded()
+    if not hasattr(sorted_model, "permute"):
+        raise NotApplicableError("the model is no set of anchors or Gaussians")
+    stored = tensors_of(subject.model)
+    count = len(next(stored[name] for name in POSITIONS if name in stored))
+    sorted_model.permute(np.arange(count)[::-1].copy())
+    again = subject.fresh()
+    again.load(subject.save(sorted_model), device="cpu")
+    for period in range(subject.data.num_periods):
+        a, b = (m.render(subject.data.views[0], float(period)).rgb for m in (subject.method, again))
+        error = float(np.abs(a - b).max())
+        demand(error < _ROUNDING, f"permute, period {period}", "nearly equal pixels", error)
 
 
 def a_resumed_training_ends_the_same(subject: Subject) -> None:
@@ -140,6 +161,7 @@ CHECKS = (
     loading_unpickles_nothing,
     saving_again_gives_equal_bytes,
     a_loaded_model_is_the_same,
+    another_order_shows_the_same,
     a_resumed_training_ends_the_same,
     a_damaged_training_is_refused,
     a_damaged_model_is_refused,

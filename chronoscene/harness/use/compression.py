@@ -48,14 +48,12 @@ from chronoscene.io.documents import read_json_document
 from chronoscene.io.log import Log
 from chronoscene.io.staging import sha256_of, staged_folder, write_text_atomic
 from chronoscene.kernels.runtime import set_threads
-from chronoscene.methods import Method
+from chronoscene.methods import POSITIONS, Method
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.metrics.registry import make_scorers
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.scene import spread_frames
 
-POSITIONS = ("anchors", "means")
-"""Names of the tensor of positions."""
 MIN_ROWS = 256
 """Tensors with fewer rows are not worth a table of symbols."""
 PROBE_VIEWS, LOSS_VIEWS = 9, 24
