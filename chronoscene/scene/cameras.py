@@ -130,11 +130,11 @@ def as_pinhole(camera: Camera) -> Camera:
     return replace(camera, model="PINHOLE", params=(fx, fy, cx, cy))
 
 
-def way_to_pinhole(camera: Camera) -> str:
-    """Advice on a camera with distortion."""
+def way_to_pinhole(camera: Camera, arguments: str = "") -> str:
+    """Advice on a camera with distortion; ``arguments``: of the command that it may name."""
     if camera.model == "EQUIRECTANGULAR":  # `undistorted_camera` refuses it
         return "render perspective views of the panoramas, and register those"
-    return "run chronoscene undistort"
+    return f"run chronoscene undistort {arguments}".rstrip()
 
 
 def project_points(camera: Camera, xyz: Array) -> Array:

@@ -14,7 +14,7 @@ from chronoscene.harness.files.strategies import STRATEGIES, period_part
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import MethodSpec, TrainingSet, TrainingView, View
 from chronoscene.scene import Frame, Scene
-from chronoscene.scene.cameras import PINHOLE_MODELS, project_points
+from chronoscene.scene.cameras import PINHOLE_MODELS, project_points, way_to_pinhole
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3
 
@@ -127,7 +127,7 @@ def check_scene(scene: Scene) -> None:
                 expected=f"a camera without distortion ({', '.join(PINHOLE_MODELS)}, or "
                 "another model whose distortion parameters are all zero)",
                 found=frame.camera.model,
-                todo=f"run 'chronoscene undistort {scene.root} OUT' and use OUT",
+                todo=f"{way_to_pinhole(frame.camera, f'{scene.root} OUT')} first",
             )
     if not scene.select(split="train"):
         raise SceneError(

@@ -32,6 +32,7 @@ from chronoscene.registration.photos.stated import stated
 from chronoscene.registration.report.coordinates import local_frame
 from chronoscene.registration.result import ANOTHER_PLACE
 from chronoscene.scene import Frame, Scene
+from chronoscene.scene.cameras import way_to_pinhole
 from chronoscene.scene.geometry import camera_centre
 
 _ORIENTATION = 0x0112
@@ -264,7 +265,7 @@ def _check_pinhole(scene: Scene, frame: Frame) -> None:
             scene.image_path(frame),
             expected="an undistorted image, of the same size as its camera",
             found=f"{camera.model} {camera.width} x {camera.height}, file {size[0]} x {size[1]}",
-            todo="undistort the scene first: chronoscene undistort",
+            todo=f"{way_to_pinhole(camera)} first",
         )
 
 

@@ -278,7 +278,7 @@ def test_distorted_cameras_are_refused(make_scene):
     )
     bent = scene.with_frames([replace(scene.frames[0], camera=camera), *scene.frames[1:]])
     with pytest.raises(
-        SceneError, match=r"a/0\.png: expected .* found OPENCV; run 'chronoscene undistort"
+        SceneError, match=r"a/0\.png: expected .* found OPENCV; run chronoscene undistort"
     ):
         parts_of(bent, "joint")
 
