@@ -35,7 +35,7 @@ demo: $(DEMO)/.made
 		--budget $(DEMO_BUDGET) --out $(DEMO)/runs
 	rm -rf $(DEMO)/page
 	$(BIN)/chronoscene page $(DEMO)/runs/demo/chronogs-*/seed0 --out $(DEMO)/page
-	@echo "The scene is in $(SCENE); tables, figures and predictions are in $(DEMO)/runs."
+	@echo "The scene is in $(SCENE); scores, figures and predictions are in $(DEMO)/runs."
 	@echo "To walk through it, open $(DEMO)/page/index.html in a browser."
 
 # The mark stands beside the scene: nothing is ever written into a dataset folder. A scene without

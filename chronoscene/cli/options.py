@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterable
 from functools import reduce
@@ -78,12 +79,12 @@ def refuse_options(names: Iterable[str], condition: str) -> None:
 
 
 def split_list(option: str, text: str) -> tuple[str, ...]:
-    """Split a comma-separated list, without repetitions.
+    """Split a comma-separated list, without repetitions; names may have commas in parentheses.
 
     Raises:
         ConfigError: If an item is empty.
     """
-    items = [item.strip() for item in text.split(",")]
+    items = [item.strip() for item in re.split(r",(?![^(]*\))", text)]
     if not all(items):
         raise ConfigError(
             option, expected="names separated by commas", found=repr(text), todo="correct the list"

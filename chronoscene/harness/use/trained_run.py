@@ -276,7 +276,7 @@ class TrainedRun:
         if not hasattr(model, "to_gaussians"):
             raise ConfigError(
                 self.folder,
-                expected="a model made of Gaussians, as pages, exports and surveys need",
+                expected="a model made of Gaussians, as pages and exports need",
                 found=self.spec.title,
                 todo="choose a run of another method, such as chronogs; render and view show this "
                 "one",

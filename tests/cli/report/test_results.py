@@ -260,6 +260,7 @@ def test_wrong_input_is_told(runs, tmp_path):
 
 def test_lists():
     assert split_list("--x", "a, b,a") == ("a", "b")
+    assert split_list("--x", "PSNR,LPIPS (VGG, 3DGS)") == ("PSNR", "LPIPS (VGG, 3DGS)")
     with pytest.raises(ConfigError, match="--x: expected names separated by commas"):
         split_list("--x", "a,")
 
