@@ -73,7 +73,7 @@ def test_hardly_any_gaussian_goes_through_autograd() -> None:
 
 
 def test_what_is_not_finite_is_named() -> None:
-    trainer = trainer_of({})
+    trainer = trainer_of({"offsets_per_anchor": 5})  # of which the first is drawn
     with torch.no_grad():
         trainer.model.heads["color"].b2[0] = np.nan
     result, _ = learn(trainer, "direct")
