@@ -124,7 +124,7 @@ def test_coordinates_in_feet_have_heights_in_feet() -> None:
     ("text", "axes"), [("EPSG:2053", "west and south"), ("EPSG:5513", "south and west")]
 )
 def test_axes_that_are_not_east_and_north_are_read_but_not_written(text: str, axes: str) -> None:
-    """Of South Africa and of Czechia: the second is even left-handed."""
+    """Systems of South Africa and of Czechia: the second is even left-handed."""
     assert not read_reference_system("", text).is_east_north
     with pytest.raises(ConfigError, match=f"one whose axes point {axes} .{text}"):
         read_projected("--crs", text)

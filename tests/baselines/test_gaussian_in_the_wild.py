@@ -403,7 +403,7 @@ def test_the_features_of_periods_are_read_anew_after_a_step_and_a_resumed_traini
 
 
 def test_gaussians_in_another_order_look_the_same(tmp_path: Path) -> None:
-    """What they read from photos goes with them: compressed models are sorted."""
+    """Features read from photos move with their Gaussians: compressed models are sorted."""
     scene = two_periods()
     method = begun(scene, 40)
     method.save(tmp_path)

@@ -149,7 +149,7 @@ def test_the_reference_system_is_checked_before_any_work(
 
 
 def test_axes_of_control_are_checked_before_any_work(tmp_path: Path) -> None:
-    """What is written in that system is called east and north."""
+    """Coordinates of the output are called east and north."""
     file = tmp_path / "gcp.csv"
     file.write_text("# crs: EPSG:5513\np,0.jpg,1,2,1040000,730000,300\n")
     done = call(photos(tmp_path / "in/a", 3).parent, tmp_path / "out", "--tie-points", file)
