@@ -213,6 +213,20 @@ def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | No
     return None if whole is None else (whole.to_sim3(), np.asarray(used))
 
 
+def scale_deviation(residuals: Array, target: Array) -> float:
+    """Relative standard deviation of the scale of a similarity that was fitted to points.
+
+    Args:
+        residuals: After the fit; the standard deviation of one coordinate is estimated from
+            them. [N, 2] in a plane, or [N, 3]
+        target: The points, whose spread is what determines the scale. The same shape.
+    """
+    unknowns = 4 if target.shape[1] == 2 else 7
+    deviation = np.sqrt((residuals**2).sum() / max(target.size - unknowns, 1))
+    spread = np.linalg.norm(target - target.mean(axis=0))
+    return float(deviation / max(spread, 1e-9))
+
+
 def _thickness(points: Array) -> float:
     """Divide the second singular value by the first: 0 on a line."""
     values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)

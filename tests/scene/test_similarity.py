@@ -12,7 +12,7 @@ from chronoscene.scene.geometry import (
     pose_from_rotation_translation,
     rotation_from_quaternion,
 )
-from chronoscene.scene.similarity import Sim3, fit, fit_few, fit_robustly
+from chronoscene.scene.similarity import Sim3, fit, fit_few, fit_robustly, scale_deviation
 
 unit = st.floats(-1, 1, allow_subnormal=False)
 rotations = (
@@ -149,3 +149,16 @@ def test_along_two_axes_a_wrong_height_is_no_distance():
     for axes, expected in ((3, 5.0), (2, 0.0)):
         _, distances = fit_robustly(source, target, axes=axes)
         assert distances[0] == pytest.approx(expected, abs=0.3)
+
+
+def test_the_deviation_of_a_scale_is_that_of_repeated_fits() -> None:
+    rng = np.random.default_rng(5)
+    target = rng.uniform(-20, 20, (12, 3)) * [1, 1, 0.2]
+    scales, stated = [], []
+    for _ in range(400):
+        noisy = target + rng.normal(0, 1.5, target.shape)
+        found = fit(target, noisy)
+        assert found is not None
+        scales.append(found.scale)
+        stated.append(scale_deviation(found.apply(target) - noisy, noisy))
+    assert np.median(stated) == pytest.approx(np.std(scales), rel=0.12)

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Ints
 from chronoscene.registration.quality.left_out import (
     contradicted,
     errors_left_out,
@@ -34,6 +34,7 @@ from chronoscene.registration.ties.control import CONTRADICTION
 from chronoscene.registration.ties.residuals import PointResidual
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import scale_deviation
 
 _COMPARE = (
     "compare the reference system, the coordinates and the clicks of the points with the largest "
@@ -183,7 +184,7 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if points and gps is not None:
         gap = float(np.linalg.norm(np.median(_gps_errors(model)[1][:, :2], axis=0)))
         objections += check(POSITION_THRESHOLDS["gps"], gap, "ground control and GPS", "gps")
-    scale_error = None if gps is None else _scale_error(model, gps)
+    scale_error = None if gps is None else _scale_error(model)
     if scale_error is not None and not controlled:
         objections += check(POSITION_THRESHOLDS["scale"], 100 * scale_error, "GPS", "scale")
     compared = compare_with_metadata(model)
@@ -243,21 +244,19 @@ def _gps_errors(model: Registered) -> tuple[list[str], Array]:
     Returns:
         Names of their images, and errors in metres. [G, 3]
     """
-    use = np.flatnonzero(model.gps_used & np.isfinite(model.gps_enu).all(axis=1))
+    use = _with_used_gps(model)
     errors = camera_centre(model.cam_from_world[use]) - model.gps_enu[use]
     return [model.names[i] for i in use], errors
 
 
-def _scale_error(model: Registered, gps: Rmse) -> float:
-    """Relative standard deviation of the scale, from the horizontal residuals of all positions.
+def _with_used_gps(model: Registered) -> Ints:
+    return np.flatnonzero(model.gps_used & np.isfinite(model.gps_enu).all(axis=1))
 
-    Their variance is that of one coordinate: four unknowns were fitted to two of each position.
-    """
-    use = model.gps_used & np.isfinite(model.gps_enu).all(axis=1)
-    flat = model.gps_enu[use][:, :2]
-    spread = float(np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum()))
-    deviation = gps.horizontal * np.sqrt(gps.count / max(2 * gps.count - 4, 1))
-    return float(deviation / max(spread, 1e-9))
+
+def _scale_error(model: Registered) -> float:
+    """Relative standard deviation of the scale, from the horizontal residuals of all positions."""
+    flat = model.gps_enu[_with_used_gps(model), :2]
+    return scale_deviation(_gps_errors(model)[1][:, :2], flat)
 
 
 def _errors(place: str, rmse: Rmse | None, pixel: float | None) -> Iterator[Objection]:

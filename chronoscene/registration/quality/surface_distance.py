@@ -2,7 +2,7 @@
 
 Every point is placed by the images of one period alone. Around core points of one cloud, both
 clouds are averaged along the local normal; what is left is compared with the level of detection,
-``1.96 sqrt(s1^2 / n1 + s2^2 / n2) + registration error``.
+``1.96 (sqrt(s1^2 / n1 + s2^2 / n2) + registration error)``.
 
 Source: Lague, Brodu and Leroux 2013 (M3C2). Ours takes a fixed number of neighbours within a radius
 instead of a cylinder, because sparse clouds differ widely in density.
@@ -185,7 +185,7 @@ def _mean_within(along: Array, inside: Mask) -> tuple[Array, Array, Array]:
 
 def _summary(cores: int, stable: _Patches, registration: float) -> SurfaceDistance:
     """Figures of the core points that did not change."""
-    level = CONFIDENCE * stable.chance + registration
+    level = CONFIDENCE * (stable.chance + registration)
     size = np.abs(stable.distance)
     return SurfaceDistance(
         cores=cores,

@@ -13,7 +13,7 @@ from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.reconstruct.alignment import fit_sim3
 from chronoscene.registration.reconstruct.models import as_pycolmap, image_pose, sorted_ids
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.scene.similarity import Sim3, fit_robustly
+from chronoscene.scene.similarity import Sim3, fit_robustly, scale_deviation
 
 MAX_SCALE_ERROR = 0.1
 """Relative standard deviation of the scale above which GPS does not determine it."""
@@ -129,16 +129,13 @@ def _described(
     inliers[near] = True
     used = 2 if by_horizon else 3
     axes = np.sqrt(np.mean(difference[near] ** 2, axis=0))
-    rms = float(np.linalg.norm(axes[:used]))
-    flat = enu[near][:, :used]
-    spread = float(np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum(axis=1).mean()))
     return GpsAlignment(
         enu_from_model=similarity,
         inliers=inliers,
         residuals=np.linalg.norm(difference[:, :used], axis=1),
-        rms=rms,
+        rms=float(np.linalg.norm(axes[:used])),
         axes=axes,
-        scale_error=rms / max(spread * np.sqrt(len(near)), 1e-12),
+        scale_error=scale_deviation(difference[near, :used], enu[near, :used]),
         on_a_line=on_a_line,
         by_horizon=by_horizon,
     )

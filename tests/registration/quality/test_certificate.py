@@ -373,6 +373,17 @@ def test_clouds_find_a_shift_without_matches(shift: tuple[float, float, float]) 
         assert found.beyond < 0.1
 
 
+def test_the_level_of_detection_has_the_error_of_registration_at_its_confidence() -> None:
+    rng = np.random.default_rng(0)
+    clouds = as_cloud(plane(rng, 2000, 0.02)), as_cloud(plane(rng, 2000, 0.02))
+    levels = []
+    for registration in (0.0, 0.5):
+        found = surface_distance(*clouds, np.zeros(3) + 5.0, registration)
+        assert isinstance(found, SurfaceDistance)
+        levels.append(found.level)
+    assert levels[1] - levels[0] == pytest.approx(1.96 * 0.5)
+
+
 def boxes(rng: np.random.Generator, noise: float) -> np.ndarray:
     """Walls of 20 boxes on flat ground, with a dozen points each."""
     middle = np.random.default_rng(7).uniform(-50, 50, (20, 2))

@@ -202,9 +202,23 @@ def test_a_scale_known_to_nine_percent_is_no_metre(make_scene_folder: Callable[.
     model, centres = as_model(make_scene_folder)
     rng = np.random.default_rng(14)
     spread = float(np.sqrt(np.stack(list(centres.values())).var(axis=0).sum()))
-    noise = 0.088 * spread * np.sqrt(40 / 3)
+    noise = 0.088 * spread * np.sqrt(40)
     enu = {n: (c + rng.normal(0, noise, 3)).tolist() for n, c in centres.items()}
     remarks: list[str] = []
     moved, _ = to_gps_frame(model, Priors(enu, dict.fromkeys(enu, [5.0] * 3)), remarks)
     assert not moved
     assert any("not accurate enough for metres" in r for r in remarks)
+
+
+@pytest.mark.parametrize("height_noise", [1.0, 30.0])  # the latter leaves heights out
+def test_the_stated_error_of_the_scale_is_that_of_repeated_flights(height_noise: float) -> None:
+    rng = np.random.default_rng(15)
+    world = flight(rng)
+    scales, stated = [], []
+    for _ in range(60):
+        noise = rng.normal(0, [1.0, 1.0, height_noise], (40, 3))
+        found = align_to_gps(world, camera_centre(world) + noise)
+        assert found is not None and found.by_horizon is (height_noise > 1)
+        scales.append(found.enu_from_model.scale)
+        stated.append(found.scale_error)
+    assert np.median(stated) == pytest.approx(np.std(scales), rel=0.25)
