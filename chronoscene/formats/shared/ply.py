@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -59,7 +60,11 @@ def write_points(path: Path, points: Points) -> None:
 
 
 def write_vertices(
-    path: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8], **columns: NDArray[Any]
+    path: Path,
+    xyz: NDArray[np.float64],
+    rgb: NDArray[np.uint8],
+    comments: Sequence[str] = (),
+    **columns: NDArray[Any],
 ) -> None:
     """Write positions (double), colours, and further columns as a binary PLY file.
 
@@ -67,6 +72,7 @@ def write_vertices(
         path: The file.
         xyz: [N, 3]
         rgb: [N, 3]
+        comments: For the header.
         columns: By their names; of a type that PLY has. [N]
     """
     columns = (
@@ -75,7 +81,8 @@ def write_vertices(
     vertices = np.empty(len(xyz), [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         vertices[name] = column
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(path)
+    element = PlyElement.describe(vertices, "vertex")
+    PlyData([element], byte_order="<", comments=list(comments)).write(path)
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, np.dtype]:

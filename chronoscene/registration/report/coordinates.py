@@ -6,8 +6,6 @@ distorted by a map projection. Here every position is converted by itself, in fl
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,13 +15,14 @@ from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
 
 from chronoscene.arrays import Array
+from chronoscene.formats.shared.ply import write_vertices
 from chronoscene.geodesy import Georeference, HeightKind, ReferenceSystem, from_crs
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.laz import write_laz
 from chronoscene.io.staging import replacing, write_text_atomic
+from chronoscene.io.tables import csv_text
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import PointResidual
 from chronoscene.scene import Scene
@@ -132,15 +131,12 @@ def _write_cameras(path: Path, model: Placed, frame: Georeference, output: Refer
     places = output.from_local(frame, centres)
     axes = output.derivative(frame, centres)
     angles = omega_phi_kappa(model.cam_from_world[:, :3, :3], axes)
-    rows = zip(model.names, model.labels, places, angles, strict=True)
-    _write_table(
-        path,
-        ("image", "period", "E", "N", "h", "omega", "phi", "kappa"),
-        (
-            (name, label, *_metres(place), *(f"{a:.6f}" for a in angle))
-            for name, label, place, angle in rows
-        ),
+    rows = (
+        (name, label, *_metres(place), *(f"{a:.6f}" for a in angle))
+        for name, label, place, angle in zip(model.names, model.labels, places, angles, strict=True)
     )
+    head = ("image", "period", "E", "N", "h", "omega", "phi", "kappa")
+    write_text_atomic(path, csv_text(head, rows))
 
 
 def omega_phi_kappa(rotations: Array, axes: Array) -> Array:
@@ -165,15 +161,9 @@ def omega_phi_kappa(rotations: Array, axes: Array) -> Array:
 
 def _write_points(path: Path, model: Placed, frame: Georeference, output: ReferenceSystem) -> None:
     """Write coordinates of 64 bits: those of 32 bits are exact to half a metre only."""
-    kinds = [(axis, "f8") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")]
-    rows = np.empty(len(model.points), kinds)
     places = output.from_local(frame, model.points)
-    for i in range(3):
-        rows["xyz"[i]] = places[:, i]
-        rows[("red", "green", "blue")[i]] = model.colors[:, i]
-    data = PlyData([PlyElement.describe(rows, "vertex")], comments=[f"crs {output.text}"])
     with replacing(path) as partial:
-        data.write(str(partial))
+        write_vertices(partial, places, model.colors, comments=(f"crs {output.text}",))
     if find_spec("laspy") is not None and len(places):
         with replacing(path.with_name(POINTS_LAZ)) as partial:
             write_laz(partial, places, model.colors, output.text, step=0.1**DECIMALS)
@@ -185,29 +175,18 @@ def write_control(path: Path, points: Sequence[PointResidual]) -> None:
         "point", "role", "used", "clicks", "periods", "E", "N", "h", "error_E", "error_N",
         "error_h", "click_consistency_px", "note",
     )  # fmt: skip
-    _write_table(
-        path,
-        head,
+    rows = (
         (
-            (
-                r.name, r.role, int(r.used), r.clicks, " ".join(r.periods),
-                *(_metres(r.surveyed) if r.surveyed else [""] * 3),
-                *(_metres(r.error) if r.error else [""] * 3),
-                "" if r.click_consistency is None else f"{r.click_consistency:.3f}", r.note,
-            )
-            for r in points
-            if r.role != "tie"
-        ),
+            r.name, r.role, int(r.used), r.clicks, " ".join(r.periods),
+            *(_metres(r.surveyed) if r.surveyed else [""] * 3),
+            *(_metres(r.error) if r.error else [""] * 3),
+            "" if r.click_consistency is None else f"{r.click_consistency:.3f}", r.note,
+        )
+        for r in points
+        if r.role != "tie"
     )  # fmt: skip
+    write_text_atomic(path, csv_text(head, rows))
 
 
 def _metres(values: Iterable[float]) -> list[str]:
     return [f"{round(value, DECIMALS) + 0.0:.{DECIMALS}f}" for value in values]  # no -0.0000
-
-
-def _write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    write_text_atomic(path, text.getvalue())
