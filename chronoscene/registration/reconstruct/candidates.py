@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from chronoscene.arrays import Ints
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features.database import copy_with_cameras
+from chronoscene.registration.features.database import copy_with_cameras, verified_matches
 from chronoscene.registration.reconstruct.consistency import Matches, misplaced, pair_agreements
 
 SHORT_ANGLE = 0.5  # Degrees between the rays of points of short tracks
@@ -48,14 +46,9 @@ def support(model: pycolmap.Reconstruction, matches: Matches) -> int:
 def without_weak_pairs(database: str, copy: Path, periods: Mapping[str, int]) -> int:
     """Copy a database without `weak_pairs`, and return their number."""
     copy_with_cameras(database, copy, {})
+    names, matches = verified_matches(copy)
+    weak = weak_pairs(matches, {i: periods[name] for i, name in names.items()})
     with pycolmap.Database.open(str(copy)) as opened:
-        period = {int(i.image_id): periods[str(i.name)] for i in opened.read_all_images()}
-        pair_ids, geometries = opened.read_two_view_geometries()
-        matches = {}
-        for pair_id, geometry in zip(pair_ids, geometries, strict=True):
-            a, b = pycolmap.pair_id_to_image_pair(pair_id)
-            matches[int(a), int(b)] = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-        weak = weak_pairs(matches, period)
         for a, b in weak:
             opened.delete_two_view_geometry(a, b)
     return len(weak)
@@ -85,6 +78,6 @@ def weak_pairs(matches: Matches, period: Mapping[int, int]) -> list[tuple[int, i
         (a, b)
         for (a, b), pairs in matches.items()
         if period[a] != period[b]
-        and 0 < len(pairs) < CERTAIN_INLIERS
+        and len(pairs) < CERTAIN_INLIERS
         and confirmed(a, b, pairs) < CONFIRMED
     ]
