@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +14,6 @@ from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.masks import find_masks
-from chronoscene.images.store import Progress
 from chronoscene.io.staging import check_not_current, needing_space, write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
 from chronoscene.registration.quality.position import Position, judge_position
@@ -31,7 +28,6 @@ from chronoscene.registration.ties.tie_points import TiePoints
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
 from chronoscene.scene.splits import default_tests, split_of
 from chronoscene.scene.tracks import reproject, track_owners
-from chronoscene.undistort import undistort
 
 LOG = "registration_log.json"
 CERTIFICATE = "registration.json"
@@ -116,23 +112,6 @@ def check_free(out: Path, *, overwrite: bool) -> None:
         found="one in use",
         todo="choose another folder, or --overwrite if it is an earlier registration",
     )
-
-
-def write_scene(scene: Scene, staged: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Undistort a scene into a staging folder, and count images and points for the log."""
-    shutil.rmtree(staged, ignore_errors=True)
-    done = undistort(scene, staged, progress=progress)
-    return {
-        "images": len(done.scene.frames),
-        "points": len(done.scene.points),
-        "observations_lost": done.observations_lost,
-        "points_lost": done.points_lost,
-    }
-
-
-def write_log(staged: Path, log: Mapping[str, Any]) -> None:
-    """Write the log."""
-    write_text_atomic(staged / LOG, json.dumps(log, indent=1, ensure_ascii=False) + "\n")
 
 
 def publish(staged: Path, out: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,7 @@ from chronoscene.colmap.model import copy_poses
 from chronoscene.errors import ConfigError
 from chronoscene.geodesy import ReferenceSystem, read_projected
 from chronoscene.io.processes import Report
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.control.route import check_options, resect_photos
@@ -26,6 +30,7 @@ from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
 from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
 from chronoscene.registration.work_folder import Stages, work_folder
 from chronoscene.scene import Scene
+from chronoscene.undistort import undistort
 
 SCHEMA_VERSION = 1  # Version of the log
 
@@ -102,7 +107,8 @@ def run(
         for name, judged in (("alignment", found.verdict), ("absolute position", found.position)):
             context.stages.remark(name, f"{judged.level}: {judged.text}")
         write_coordinates(staged, placed_model(registered), registered.georeference, crs)
-        output.write_log(staged, _log(registered, inputs, context))
+        log = json.dumps(_log(registered, inputs, context), indent=1, ensure_ascii=False)
+        write_text_atomic(staged / output.LOG, log + "\n")
         output.check_free(out, overwrite=options.overwrite)
         output.publish(staged, out)
     if inspected is not None:
@@ -136,13 +142,13 @@ def _stage_scene(registered: Registered, inputs: PhotoInputs, name: str, context
     scene = output.as_scene(registered, name)
     if old is not None:
         scene = add_period(old, scene, registered)
-
-    def progress(done: int, total: int) -> None:
-        if context.report is not None:
-            context.report("images", done, total)
-
-    counts = output.write_scene(scene, staged, progress=progress)
-    remarks = [", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())]
+    shutil.rmtree(staged, ignore_errors=True)
+    progress = None if context.report is None else partial(context.report, "images")
+    done = undistort(scene, staged, progress=progress)
+    remarks = [
+        f"{len(done.scene.frames)} images, {len(done.scene.points)} points, "
+        f"{done.observations_lost} observations lost, {done.points_lost} points lost"
+    ]
     if old is not None:
         kept = copy_poses(old.root / "sparse/0", staged / "sparse/0")
         remarks.append(f"poses of {kept} images copied unchanged")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -194,10 +195,7 @@ def _write(
     for frame in scene.frames:
         our_format.check_writable_name(out, frame)
 
-    def progress(done: int, total: int) -> None:
-        if report is not None:
-            report("images", done, total)
-
+    progress = None if report is None else partial(report, "images")
     with staged_folder(out) as staged:
         our_format.write_texts(scene, staged)
         if model is not None and _has_poses(model, scene):
