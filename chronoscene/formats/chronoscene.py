@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,18 +63,10 @@ def read(path: Path, *, model: Model | None = None, empty_periods: bool = False)
     periods, problems = splits.assign_periods(names, entries)
     raise_first(path / SPLIT, (p for p in problems if p.kind != "empty" or not empty_periods))
     tests, rule = read_tests(path, names, periods)
-    return Scene(
-        name=path.resolve().name,
-        root=path,
-        images_root=path / "images",
-        frames=make_frames(model, periods, tests),
-        points=model.points,
-        periods=read_periods(path, 1 + max(entry.period for entry in entries)),
-        split_rule=rule,
-        format=NAME,
-        world=read_world(path),
-        masks=find_masks(path, names),
-    )
+    table = read_periods(path, 1 + max(entry.period for entry in entries))
+    grouped = {name: periods[name] for name in names}, table
+    scene = make_scene(path, path / "images", model, grouped, tests, rule=rule, format=NAME)
+    return replace(scene, world=read_world(path))
 
 
 def _read_model(path: Path) -> Model:
@@ -138,18 +131,38 @@ def check_name(place: Path, name: str) -> None:
         )
 
 
-def make_frames(model: Model, periods: dict[str, int], tests: set[str]) -> tuple[Frame, ...]:
-    """Make frames of the registered images, in their order."""
-    return tuple(
-        Frame(
-            name=image.name,
-            image_id=image.image_id,
-            camera=image.camera,
-            cam_from_world=image.cam_from_world,
-            period=periods[image.name],
-            split=splits.split_of(image.name, tests),
-        )
-        for image in model.images
+def make_scene(
+    path: Path,
+    images: Path,
+    model: Model,
+    grouped: tuple[dict[str, int], tuple[Period, ...]],
+    tests: set[str],
+    *,
+    rule: str,
+    format: str,
+) -> Scene:
+    """Make a scene of a model whose images have their periods."""
+    periods, table = grouped
+    return Scene(
+        name=path.resolve().name,
+        root=path,
+        images_root=images,
+        frames=tuple(
+            Frame(
+                name=image.name,
+                image_id=image.image_id,
+                camera=image.camera,
+                cam_from_world=image.cam_from_world,
+                period=periods[image.name],
+                split=splits.split_of(image.name, tests),
+            )
+            for image in model.images
+        ),
+        points=model.points,
+        periods=table,
+        split_rule=rule,
+        format=format,
+        masks=find_masks(images.parent, periods),
     )
 
 

@@ -76,7 +76,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
             todo="name images with their dates in train.txt, and not in trash.txt",
         )
     dated = [name for name in used if name in dates]
-    scene = colmap_layout.make_scene(
+    scene = our_format.make_scene(
         path,
         path / PLACE[1],
         colmap_layout.keep_images(model, dates.keys()),

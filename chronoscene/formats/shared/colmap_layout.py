@@ -20,7 +20,6 @@ from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.grouping import Grouped, natural_key
-from chronoscene.images.masks import find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Scene
@@ -89,7 +88,9 @@ def read_scene(
     tests, rule = assigned.tests, assigned.rule
     if tests is None:
         tests, rule = our_format.read_tests(path, names, assigned.grouped[0])
-    scene = make_scene(path, images, posed, assigned.grouped, tests, rule=rule, format=format)
+    scene = our_format.make_scene(
+        path, images, posed, assigned.grouped, tests, rule=rule, format=format
+    )
     if labelled and (path / our_format.PERIODS).exists():
         scene = replace(scene, periods=our_format.read_periods(path, scene.num_periods))
     return replace(scene, world=our_format.read_world(path))
@@ -131,31 +132,6 @@ def keep_images(model: Model, names: Collection[str]) -> Model:
     images = tuple(model.images[i] for i in kept)
     points = model.points
     return Model(images, points.select_observations(rank[points.track_frame] >= 0, rank))
-
-
-def make_scene(
-    path: Path,
-    images: Path,
-    model: Model,
-    grouped: Grouped,
-    tests: set[str],
-    *,
-    rule: str,
-    format: str,
-) -> Scene:
-    """Make a scene of a model whose images have their periods."""
-    periods, table = grouped
-    return Scene(
-        name=path.resolve().name,
-        root=path,
-        images_root=images,
-        frames=our_format.make_frames(model, periods, tests),
-        points=model.points,
-        periods=table,
-        split_rule=rule,
-        format=format,
-        masks=find_masks(images.parent, periods),
-    )
 
 
 def write_renamed(
