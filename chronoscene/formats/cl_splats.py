@@ -157,12 +157,11 @@ def write(
 def losses(scene: Scene) -> list[str]:
     """List the content of a scene that this format, or the loader that it is for, cannot hold."""
     names = _written_names(scene)
-    old = {new: name for name, new in names.items()}
-    rule = f"every {TEST_EVERY}th image of all"
+    tests, rule = sorted(names.values())[::TEST_EVERY], f"every {TEST_EVERY}th image of all"
     return [
         *colmap_layout.lost_names(names),
         *colmap_layout.lost_masks(scene),
-        *colmap_layout.lost_split(scene, {old[name] for name in sorted(old)[::TEST_EVERY]}, rule),
+        *colmap_layout.lost_split(scene, names, tests, rule),
     ]
 
 

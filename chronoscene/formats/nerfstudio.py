@@ -352,15 +352,11 @@ def _to_json(scene: Scene) -> dict[str, Any]:
                 "period": frame.period,
                 "time": frame.period / max(1, scene.num_periods - 1),
                 **_camera_keys(frame.camera),
-                **_mask_key(scene, frame.name),
+                **({"mask_path": mask_place(frame.name)} if frame.name in scene.masks else {}),
             }
             for frame in scene.frames
         ],
     }
-
-
-def _mask_key(scene: Scene, name: str) -> dict[str, str]:
-    return {"mask_path": mask_place(name)} if name in scene.masks else {}
 
 
 def _camera_keys(camera: Camera) -> dict[str, Any]:

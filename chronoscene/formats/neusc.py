@@ -117,13 +117,12 @@ def write(
 def losses(scene: Scene) -> list[str]:
     """List the content of a scene that this format, or the loader that it is for, cannot hold."""
     names = _written_names(scene)
-    old = {new: name for name, new in names.items()}
-    tests = {old[name] for name in sorted(old)[::TEST_EVERY]}
+    tests, rule = sorted(names.values())[::TEST_EVERY], f"every {TEST_EVERY}th image of all"
     lost = colmap_layout.lost_names(names)
     if not _dated(scene):
         lost.append("periods that are not in different years: they become the years 1, 2, ...")
     lost += colmap_layout.lost_masks(scene)
-    return lost + colmap_layout.lost_split(scene, tests, f"every {TEST_EVERY}th image of all")
+    return lost + colmap_layout.lost_split(scene, names, tests, rule)
 
 
 def _written_names(scene: Scene) -> dict[str, str]:

@@ -117,24 +117,19 @@ def _one_camera(scene: Scene, out: Path) -> Camera:
 def losses(scene: Scene) -> list[str]:
     """List the content of a scene that this format, or the loader that it is for, cannot hold."""
     names = _names(scene)
-    old = {new: name for name, new in names.items()}
-    taken = default_tests({names[f.name]: f.period for f in scene.frames})
+    tests = default_tests({names[f.name]: f.period for f in scene.frames})
     lost = colmap_layout.lost_names(names)
-    tests = {old[name] for name in taken}
-    lost += colmap_layout.lost_split(scene, tests, "images 0, 8, 16, ... of each task")
+    lost += colmap_layout.lost_split(scene, names, tests, "images 0, 8, 16, ... of each task")
     lost += colmap_layout.lost_masks(scene)
     if any(not frame.camera.is_pinhole for frame in scene.frames):
         lost.append("distortion, which its loader ignores: undistort first")
-    files = [name.rpartition("/")[2] for name in old]
+    files = [name.rpartition("/")[2] for name in names.values()]
     if len(set(files)) < len(files):
         lost.append("equal file names in several tasks, of which its replay keeps one")
     return lost
 
 
-def _folders(scene: Scene) -> list[str]:
-    """Folders of the tasks; the loader sorts full paths, so the slash takes part."""
-    return colmap_layout.period_folders(scene.periods, order=lambda folder: f"{folder}/")
-
-
 def _names(scene: Scene) -> dict[str, str]:
-    return colmap_layout.new_names(scene, _folders(scene), deep=False)
+    # The loader sorts full paths, so the slash takes part.
+    folders = colmap_layout.period_folders(scene.periods, order=lambda folder: f"{folder}/")
+    return colmap_layout.new_names(scene, folders, deep=False)

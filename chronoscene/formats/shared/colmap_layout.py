@@ -255,8 +255,10 @@ def lost_masks(scene: Scene) -> list[str]:
     return ["masks, which its loader does not read"] if scene.masks else []
 
 
-def lost_split(scene: Scene, tests: set[str], rule: str) -> list[str]:
-    """Losses of a format whose loader chooses the test images itself, by a rule in words."""
-    if {f.name for f in scene.select(split="test")} == tests:
+def lost_split(
+    scene: Scene, names: Mapping[str, str], tests: Collection[str], rule: str
+) -> list[str]:
+    """Losses of a format whose loader chooses ``tests`` of the new names, by a rule in words."""
+    if {names[f.name] for f in scene.select(split="test")} == set(tests):
         return []
     return [f"the split, because its loader takes {rule}"]
