@@ -18,7 +18,6 @@ from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference
 from chronoscene.registration.quality.misalignment import measure, transfers
 from chronoscene.registration.quality.rays import TrackRays, place, rays_at
-from chronoscene.registration.reconstruct.estimation import cross_matches
 from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene import Camera
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
@@ -332,7 +331,6 @@ def _empty(settings: CaseSettings, poses: Array, periods: Ints, gps: Array) -> R
         num_periods=settings.periods,
         labels=tuple(str(2016 + p) for p in range(settings.periods)),
         dates=tuple(str(2016 + p) for p in range(settings.periods)),
-        held_out=(),
         held_out_tracks=HeldOutTracks.empty(),
         images_root="",
     )
@@ -443,4 +441,4 @@ def _with_tracks(model: Registered, seen: _Sightings, held: _Sightings) -> Regis
     if not len(held.track):
         return model
     tracks = HeldOutTracks(_starts(held.track), held.image, held.xy)
-    return replace(model, held_out_tracks=tracks, held_out=cross_matches(tracks, model.periods))
+    return replace(model, held_out_tracks=tracks)

@@ -25,30 +25,12 @@ ANOTHER_PLACE = "another place, or wrong positions"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CrossMatches:
-    """Verified matches between two images of different periods that took no part in estimation.
-
-    Whole tracks are held out: no match of any of these keypoints, within a period or across,
-    reached the mapper.
-    """
-
-    image_a: int
-    """Index into `Registered.names`; its period is the earlier one."""
-    image_b: int
-    xy_a: Array
-    """Pixels in ``cameras[image_a]``, with its distortion. [M, 2]"""
-    xy_b: Array
-    """[M, 2]"""
-    track: Ints
-    """Held-out track of each match: index of a track in `HeldOutTracks`. [M]"""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class HeldOutTracks:
     """Observations of held-out tracks in registered images, grouped by track.
 
-    A track has at most one observation an image and is seen in at least two periods, so that it
-    can be triangulated in one and projected into another.
+    Whole tracks are held out: no match of any of their keypoints, within a period or across,
+    reached the mapper. A track has at most one observation an image and is seen in at least two
+    periods, so that it can be triangulated in one and projected into another.
     """
 
     start: Ints
@@ -115,7 +97,6 @@ class Registered:
     labels: tuple[str, ...]
     dates: tuple[str | None, ...]
     """ISO dates of the periods."""
-    held_out: tuple[CrossMatches, ...]
     held_out_tracks: HeldOutTracks
     images_root: str
     """Folder of the images: photos as ``cameras`` describe them."""

@@ -350,10 +350,11 @@ def _held_out(
 
 def _epipolar(model: Registered, evidence: Evidence, periods: tuple[int, int]) -> Array:
     """Epipolar distances of all held-out matches between two periods, pixels."""
-    errors = []
-    for matches, (first, second) in zip(model.held_out, evidence.matches, strict=True):
-        between = model.periods[[matches.image_a, matches.image_b]].tolist()
-        if len(first) and set(between) == set(periods):
+    errors, rays = [], evidence.sightings
+    for a, b in evidence.matches:
+        between = model.periods[rays.image[[a[0], b[0]]]].tolist()
+        if set(between) == set(periods):
+            first, second = rays.where(a), rays.where(b)
             relative = second.pose[0] @ np.linalg.inv(first.pose[0])
             focals = first.focal, second.focal
             errors.append(sampson_distance(relative, first.uv, second.uv, *focals))

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from chronoscene.arrays import Array, Ints, Mask
-from chronoscene.registration.result import Registered
+from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import camera_centre
@@ -112,9 +111,33 @@ def model_rays(model: Registered) -> TrackRays:
 
 
 def held_out_rays(model: Registered) -> TrackRays:
-    """Rays of the tracks that took no part in the estimation."""
+    """Rays of the observations in `Registered.held_out_tracks`; NaN where COLMAP finds none."""
     tracks = model.held_out_tracks
-    return rays_at(model, track_owners(tracks.start), tracks.image, tracks.xy).finite()
+    return rays_at(model, track_owners(tracks.start), tracks.image, tracks.xy)
+
+
+def cross_matches(tracks: HeldOutTracks, periods: Ints) -> list[tuple[Ints, Ints]]:
+    """Held-out tracks as matches between images of different periods, by pair of images.
+
+    Args:
+        tracks: Held-out tracks.
+        periods: Of the images. [N]
+
+    Returns:
+        Rows of the observations by the image of the earlier period, and by the other. [M], [M]
+    """
+    track, count = track_owners(tracks.start), np.diff(tracks.start)
+    # Each observation with every one of its track.
+    a = np.repeat(np.arange(len(track)), count[track])
+    ends = np.cumsum(count[track])
+    b = np.arange(len(a)) + np.repeat(tracks.start[track] - ends + count[track], count[track])
+    across = periods[tracks.image[a]] < periods[tracks.image[b]]
+    a, b = a[across], b[across]
+    order = np.lexsort((tracks.image[b], tracks.image[a]))
+    a, b = a[order], b[order]
+    first, second = tracks.image[a], tracks.image[b]
+    new = np.flatnonzero((np.diff(first, prepend=-1) != 0) | (np.diff(second, prepend=-1) != 0))
+    return list(zip(np.split(a, new)[1:], np.split(b, new)[1:], strict=True))
 
 
 def unproject(cameras: Sequence[Camera], image: Ints, xy: Array) -> tuple[Array, Array]:
@@ -246,8 +269,10 @@ class Evidence:
     held_out: TrackRays
     """Tracks that took no part in the estimation."""
     held_out_placed: tuple[PlacedPoints, ...]
-    matches: tuple[tuple[TrackRays, TrackRays], ...]
-    """Both ends of each of the `Registered.held_out`."""
+    sightings: TrackRays
+    """All observations of these, from `held_out_rays`."""
+    matches: tuple[tuple[Ints, Ints], ...]
+    """Rows of `sightings`, from `cross_matches`."""
 
 
 def gather(model: Registered) -> Evidence:
@@ -274,7 +299,8 @@ def gather(model: Registered) -> Evidence:
     rays = rays_at(model, point[rows], model.track_image[rows], model.track_xy[rows])
     whole = rays.where(to_place[rows]).finite()
     own = [place(whole.where(model.periods[whole.image] == p)) for p in periods]
-    held_out = held_out_rays(model)
+    sightings = held_out_rays(model)
+    held_out = sightings.finite()
     return Evidence(
         seen=seen,
         observed=tuple(rays.where(np.searchsorted(rows, mine)) for mine in observed),
@@ -285,22 +311,11 @@ def gather(model: Registered) -> Evidence:
         held_out_placed=tuple(
             place(held_out.where(model.periods[held_out.image] == p)) for p in periods
         ),
-        matches=_matches(model),
+        sightings=sightings,
+        matches=tuple(cross_matches(model.held_out_tracks, model.periods)),
     )
 
 
 def _sample(points: Ints, length: Ints, max_observations: int) -> Ints:
     """Thin out points until they have about ``max_observations`` observations."""
     return points[:: int(length[points].sum()) // max_observations + 1]
-
-
-def _matches(model: Registered) -> tuple[tuple[TrackRays, TrackRays], ...]:
-    counts = np.array([len(m.xy_a) for m in model.held_out], np.int64)
-    ends = np.concatenate([[0], np.cumsum(counts)])
-    image = [m.image_a for m in model.held_out] + [m.image_b for m in model.held_out]
-    xy = [m.xy_a for m in model.held_out] + [m.xy_b for m in model.held_out]
-    images = np.repeat(np.array(image, np.int64), np.tile(counts, 2))
-    rays = rays_at(model, images, images, np.concatenate([np.zeros((0, 2)), *xy]))
-    first, second = (rays.where(np.arange(ends[-1]) + shift) for shift in (0, ends[-1]))
-    slices = [np.arange(a, b) for a, b in pairwise(ends)]
-    return tuple((first.where(rows), second.where(rows)) for rows in slices)

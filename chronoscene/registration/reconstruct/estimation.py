@@ -14,7 +14,6 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from chronoscene.arrays import Ints
 from chronoscene.colmap.model import read_model
 from chronoscene.errors import RegistrationError
 from chronoscene.registration.context import Context
@@ -22,10 +21,10 @@ from chronoscene.registration.features.camera_groups import AUTO
 from chronoscene.registration.features.correspondences import Matched
 from chronoscene.registration.photos.inputs import PhotoInputs
 from chronoscene.registration.photos.stated import stated
-from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered, Route
+from chronoscene.registration.result import HeldOutTracks, Registered, Route
 from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.scene.tracks import seen_by_period, track_owners
+from chronoscene.scene.tracks import seen_by_period
 
 MIN_CROSS_PAIRS = 3  # Verified pairs of images that connect two periods
 MIN_CROSS_MATCHES = 100  # Matches in these pairs that connect two periods
@@ -178,7 +177,6 @@ def _assemble(
     points = without_twins(model.points)
     names = tuple(image.name for image in model.images)
     periods = np.array([inputs.periods[n] for n in names], np.int64)
-    tracks = read_held_out(context.held_out, names, inputs.periods)
     gps = dict(zip((c.name for c in inputs.images), inputs.positions.enu, strict=True))
     kept = {f.name: f for f in inputs.frames}  # poses and cameras of the scene, to the last bit
     spare = max((f.camera.camera_id for f in inputs.frames), default=0)
@@ -209,8 +207,7 @@ def _assemble(
         num_periods=len(inputs.labels),
         labels=inputs.labels,
         dates=inputs.dates_of(frozenset(names)),
-        held_out=cross_matches(tracks, periods),
-        held_out_tracks=tracks,
+        held_out_tracks=read_held_out(context.held_out, names, inputs.periods),
         images_root=str(context.photos),
         stated={c.name: stated(c) for c in inputs.images},
         short=result["short"],
@@ -258,31 +255,6 @@ def read_held_out(path: Path, names: tuple[str, ...], periods: Mapping[str, int]
     track, place, xy = track[across][order], place[across][order], xy[across][order]
     start = np.append(np.flatnonzero(np.diff(track, prepend=-1)), len(track))
     return HeldOutTracks(start.astype(np.int64), place, xy)
-
-
-def cross_matches(tracks: HeldOutTracks, periods: Ints) -> tuple[CrossMatches, ...]:
-    """Held-out tracks as matches between images of different periods, by pair of images."""
-    track, count = track_owners(tracks.start), np.diff(tracks.start)
-    # Each observation with every one of its track.
-    a = np.repeat(np.arange(len(track)), count[track])
-    ends = np.cumsum(count[track])
-    b = np.arange(len(a)) + np.repeat(tracks.start[track] - ends + count[track], count[track])
-    across = periods[tracks.image[a]] < periods[tracks.image[b]]
-    a, b = a[across], b[across]
-    order = np.lexsort((tracks.image[b], tracks.image[a]))
-    a, b = a[order], b[order]
-    first, second = tracks.image[a], tracks.image[b]
-    new = (np.diff(first, prepend=-1) != 0) | (np.diff(second, prepend=-1) != 0)
-    return tuple(
-        CrossMatches(
-            image_a=int(first[rows[0]]),
-            image_b=int(second[rows[0]]),
-            xy_a=tracks.xy[a[rows]],
-            xy_b=tracks.xy[b[rows]],
-            track=track[a[rows]],
-        )
-        for rows in np.split(np.arange(len(a)), np.flatnonzero(new))[1:]
-    )
 
 
 def reasons(

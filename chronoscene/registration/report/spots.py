@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.registration.quality.certificate import PairFigures
-from chronoscene.registration.quality.rays import Evidence, PlacedPoints, project, rays_at
-from chronoscene.registration.result import CrossMatches, Registered
+from chronoscene.registration.quality.rays import Evidence, project
+from chronoscene.registration.result import Registered
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
 
@@ -166,31 +165,24 @@ def _normal(points: Array, xyz: Array, towards: Array) -> Array:
 
 def drawn_pairs(model: Registered, evidence: Evidence) -> list[DrawnPair]:
     """All pairs of images with enough held-out matches, the best first."""
-    pairs = []
-    for matches in model.held_out:
-        if len(matches.xy_a) >= MIN_MATCHES:
-            error = _match_errors(model, matches, evidence.held_out_placed)
+    pairs, tracks = [], model.held_out_tracks
+    for a, b in evidence.matches:
+        if len(a) >= MIN_MATCHES:
+            error = _match_errors(model, evidence, a, b)
             good = np.isfinite(error)
             if good.sum() >= MIN_MATCHES:
-                xy = matches.xy_a[good], matches.xy_b[good]
-                pairs.append(DrawnPair(matches.image_a, matches.image_b, *xy, error[good]))
+                images = int(tracks.image[a[0]]), int(tracks.image[b[0]])
+                xy = tracks.xy[a[good]], tracks.xy[b[good]]
+                pairs.append(DrawnPair(*images, *xy, error[good]))
     return sorted(pairs, key=lambda p: p.median)
 
 
-def _match_errors(
-    model: Registered, matches: CrossMatches, placed: Sequence[PlacedPoints]
-) -> Array:
+def _match_errors(model: Registered, evidence: Evidence, a: Ints, b: Ints) -> Array:
     """Distance of each match to where the other period puts its point; NaN where none does."""
-    errors = np.full((2, len(matches.track)), np.nan)
-    ends = (matches.image_a, matches.image_b, matches.xy_b), (
-        matches.image_b, matches.image_a, matches.xy_a,
-    )  # fmt: skip
-    for k, (source, target, xy) in enumerate(ends):
-        points = placed[int(model.periods[source])]
-        order = np.argsort(matches.track, kind="stable")
-        found, slot = points.find(matches.track[order])
-        rows = order[found]
-        image = np.full(len(rows), target, np.int64)
-        rays = rays_at(model, image, image, xy[rows])
-        errors[k, rows] = np.linalg.norm(project(rays, points.xyz[slot])[0], axis=1)
+    rays, errors = evidence.sightings, np.full((2, len(a)), np.nan)
+    for k, (source, target) in enumerate(((a, b), (b, a))):
+        points = evidence.held_out_placed[int(model.periods[rays.image[source[0]]])]
+        found, slot = points.find(rays.track[target])
+        residual, *_ = project(rays.where(target[found]), points.xyz[slot])
+        errors[k, found] = np.linalg.norm(residual, axis=1)
     return np.asarray(np.where(np.isfinite(errors[0]), errors[0], errors[1]))

@@ -52,7 +52,7 @@ def certificate(good: Registered) -> Certificate:
 
 
 def without_held_out(model: Registered) -> Registered:
-    return replace(model, held_out=(), held_out_tracks=HeldOutTracks.empty())
+    return replace(model, held_out_tracks=HeldOutTracks.empty())
 
 
 def test_a_good_registration_passes(certificate: Certificate) -> None:

@@ -25,6 +25,7 @@ from chronoscene.registration.quality.misalignment import (
 )
 from chronoscene.registration.quality.rays import (
     TrackRays,
+    cross_matches,
     held_out_rays,
     model_rays,
     place,
@@ -308,10 +309,8 @@ def test_twelve_tracks_are_enough(exact: Generated) -> None:
 
 def test_epipolar_errors_are_zero_for_the_truth_and_grow_with_a_turn(exact: Generated) -> None:
     rays = held_out_rays(exact.model)
-    pair = exact.model.held_out[0]
-    a, b = rays.where(rays.image == pair.image_a), rays.where(rays.image == pair.image_b)
-    a, b = a.where(np.isin(a.track, b.track)), b.where(np.isin(b.track, a.track))
-    assert len(a) == len(b) == len(pair.track)
+    matches = cross_matches(exact.model.held_out_tracks, exact.model.periods)
+    a, b = (rays.where(rows) for rows in matches[0])
 
     def errors(pose: np.ndarray) -> np.ndarray:
         relative = pose @ np.linalg.inv(a.pose[0])

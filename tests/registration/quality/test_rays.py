@@ -32,7 +32,7 @@ def test_every_point_is_placed_once_in_each_period(
     monkeypatch.setattr(rays, "unproject", counted_pixels)
     inspect_registration(model, tmp_path)
     assert len(placed) == 2 * 3  # points of the model and held-out tracks, by each period
-    assert len(unprojected) == 3  # observations, held-out tracks and matches
+    assert len(unprojected) == 2  # observations and held-out tracks
 
 
 def test_samples_hold_whole_tracks(monkeypatch: pytest.MonkeyPatch) -> None:

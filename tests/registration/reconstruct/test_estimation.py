@@ -5,12 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from chronoscene.registration.reconstruct.estimation import (
-    cross_matches,
-    read_held_out,
-    reasons,
-    without_twins,
-)
+from chronoscene.registration.quality.rays import cross_matches
+from chronoscene.registration.reconstruct.estimation import read_held_out, reasons, without_twins
 from chronoscene.scene import Points
 
 
@@ -58,12 +54,8 @@ def test_held_out_tracks_of_two_periods_become_matches(tmp_path: Path) -> None:
     assert tracks.start.tolist() == [0, 3]  # the second is of one period, the third of one image
     assert tracks.image.tolist() == [0, 1, 2]
     assert tracks.xy.tolist() == [[0.0, 1.0], [4.0, 5.0], [2.0, 3.0]]
-    first, second = cross_matches(tracks, np.array([0, 0, 1]))
-    assert (first.image_a, first.image_b) == (0, 2)
-    assert (second.image_a, second.image_b) == (1, 2)
-    assert first.xy_a.tolist() == [[0.0, 1.0]]
-    assert second.xy_b.tolist() == [[2.0, 3.0]]
-    assert first.track.tolist() == [0]
+    matches = cross_matches(tracks, np.array([0, 0, 1]))
+    assert [(a.tolist(), b.tolist()) for a, b in matches] == [([0], [2]), ([1], [2])]
 
 
 def test_photos_without_a_pose_have_reasons() -> None:

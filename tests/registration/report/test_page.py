@@ -118,7 +118,6 @@ def test_page_without_photos_matches_or_points(model: Registered) -> None:
     bare = replace(
         model,
         images_root="/nowhere",
-        held_out=(),
         held_out_tracks=HeldOutTracks.empty(),
         points=np.zeros((0, 3)),
         colors=np.zeros((0, 3), np.uint8),
