@@ -166,10 +166,8 @@ def cells(points: Array) -> Ints:
     extent = max(float(np.ptp(flat, axis=0).max()), 1e-12)
     index = np.floor((flat - flat.min(axis=0)) / extent * CELLS_PER_AXIS).astype(np.int64)
     index = np.minimum(index, CELLS_PER_AXIS - 1)
-    key = np.zeros(len(points), np.int64)
-    for column in range(index.shape[1]):
-        key = key * CELLS_PER_AXIS + index[:, column]
-    return np.asarray(np.unique(key, return_inverse=True)[1], np.int64)
+    _, cell = np.unique(index, axis=0, return_inverse=True)
+    return np.asarray(cell.ravel(), np.int64)
 
 
 def cell_weights(cell: Ints) -> Array:
