@@ -124,12 +124,8 @@ class Motion:
         """Motion with other parameters."""
         return _compose(step, Sim3.identity(), self.middle)
 
-    def displacement(self, similarity: Sim3) -> float:
-        """Displacement of cameras or points, see `Misalignment.shift`."""
-        return float(self._displacements(_one(similarity))[0])
-
     def _displacements(self, moves: _Moves) -> Array:
-        """`displacement` of each of several similarities. [D]"""
+        """Displacements of cameras or points by similarities, see `Misalignment.shift`. [D]"""
         moved = np.linalg.norm(moves.apply(self.centres) - self.centres, axis=2)
         points, cameras = self.seen
         rays = points - cameras

@@ -36,7 +36,7 @@ class TieSpread:
 
 
 def tie_spread(
-    model: Registered, seen: Mask, a: int, b: int, cells: tuple[Array, Ints] | None = None
+    model: Registered, seen: Mask, a: int, b: int, cells: tuple[Array, Ints]
 ) -> TieSpread:
     """Count the tie points of two periods, and find where there are none.
 
@@ -45,10 +45,10 @@ def tie_spread(
         seen: True if an image of the period sees the point. [P, T]
         a: Earlier period.
         b: Later period.
-        cells: From `ground_plan`, where it is at hand.
+        cells: From `ground_plan`.
     """
     tie = seen[:, a] & seen[:, b]
-    plan, cell = ground_plan(model.points) if cells is None else cells
+    plan, cell = cells
     counts = [np.bincount(cell[mask], minlength=cell.max(initial=0) + 1) for mask in seen.T]
     overlap = (counts[a] >= MIN_POINTS_IN_CELL) & (counts[b] >= MIN_POINTS_IN_CELL)
     tied = np.bincount(cell[tie], minlength=len(overlap)) > 0

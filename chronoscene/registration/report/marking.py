@@ -22,6 +22,8 @@ from chronoscene.registration.ties.tie_points import TiePoints, match_images
 from chronoscene.scene.cameras import CAMERA_MODELS, PINHOLE_MODELS, POLYNOMIAL_MODELS
 from chronoscene.scene.geometry import camera_centre
 
+FILE = "points.csv"  # Name of the file that the page saves
+
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Order of the parameters on the page: that of OpenCV."""
 
@@ -36,7 +38,6 @@ def marking_page(
     model: Path | None = None,
     max_size: int = 1600,
     title: str = "Points",
-    file: str = "points.csv",
     report: Report | None = None,
 ) -> str:
     """Render the page.
@@ -47,7 +48,6 @@ def marking_page(
         model: Folder of a COLMAP model of these photos, by which places are predicted.
         max_size: Pixels of the longer side of an embedded photo.
         title: Of the page.
-        file: Name of the file that it saves.
         report: Called with the progress.
     """
     found = None if model is None else read_model(model)
@@ -65,10 +65,10 @@ def marking_page(
         "state": state,
         "depths": (1.0, 100.0) if found is None else _depths(found),
         "crs": points.crs.text if points is not None and points.crs is not None else "",
-        "file": file,
+        "file": FILE,
         "key": hashlib.sha256(repr((title, names, state)).encode()).hexdigest()[:12],
     }
-    return render_page("marking/page", title=title, file=file, data=data)
+    return render_page("marking/page", title=title, file=FILE, data=data)
 
 
 def _photo(capture: Capture, image: PosedImage | None, max_size: int) -> dict[str, Any]:

@@ -196,9 +196,7 @@ class MeshBuilder:
         normals = np.broadcast_to(normal, tris.shape)
         self._add(tris, normals, _frame_row(frame, p), style, seed)
 
-    def triangles(
-        self, vertices: Array, normals: Array, style: int, *, origin: ArrayLike, seed: int = 0
-    ) -> None:
+    def triangles(self, vertices: Array, normals: Array, style: int, *, origin: ArrayLike) -> None:
         """Add triangles of a curved surface as one patch; textures use world axes from origin.
 
         Args:
@@ -206,10 +204,9 @@ class MeshBuilder:
             normals: Unit shading normals. [N, 3, 3]
             style: Style index.
             origin: Origin of the texture. [3]
-            seed: Varies the texture.
         """
         frame = (origin, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-        self._add(vertices, normals, _frame_row(frame, vertices), style, seed)
+        self._add(vertices, normals, _frame_row(frame, vertices), style, seed=0)
 
     def build(self) -> Mesh:
         """The collected geometry."""

@@ -25,7 +25,7 @@ from chronoscene.registration.quality.gps_fit import (
 )
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment, Motion, Transfers
-from chronoscene.registration.quality.overlap import tie_spread
+from chronoscene.registration.quality.overlap import ground_plan, tie_spread
 from chronoscene.registration.quality.position import POSITION_THRESHOLDS, Position
 from chronoscene.registration.quality.rays import PlacedPoints, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
@@ -276,7 +276,8 @@ def test_tie_spread_tells_a_cluster_from_a_spread() -> None:
     values = []
     for cluster in (None, 12.0):
         model = generate_case(CaseSettings(seed=41, ties=300, cluster=cluster)).model
-        values.append(tie_spread(model, gather(model).seen, 0, 1))
+        cells = ground_plan(model.points)
+        values.append(tie_spread(model, gather(model).seen, 0, 1, cells))
     assert values[0].occupied > 0.5 > 0.15 > values[1].occupied
     assert values[0].hull > 0.7 > 0.2 > values[1].hull
     assert len(values[1].gaps) == 20

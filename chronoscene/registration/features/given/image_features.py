@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from chronoscene.errors import RegistrationError
 
 MAX_KEYPOINTS = 1_000_000  # Of a photo; more are a damaged or hostile file
-MAX_DIMENSION = 4096  # Of descriptors
 MAX_VALUES = 2**28  # Numbers in the descriptors of a photo
 MAX_RATIO = 0.8  # Of the distances to the nearest descriptor and to the second nearest
 CHUNK = 1024  # Keypoints that are compared with those of another photo at a time
