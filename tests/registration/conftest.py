@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
+from benchmarks.registration.generated import pose_errors
 from chronoscene.colmap.model import read_model
 from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
-from chronoscene.scene.similarity import fit
 from chronoscene.synth import SynthSettings, generate
 
 Array = NDArray[np.float64]
@@ -65,25 +65,18 @@ class Case:
         """
         found = self.estimated()
         names = sorted(found)
-        fitted = [n for n in names if reference is None or self.periods[n] == reference]
-        a, b = (camera_centre(np.stack([d[n] for n in fitted])) for d in (found, self.truth))
-        sim = fit(a, b)
-        assert sim is not None
+        periods = np.array([self.periods[n] for n in names])
+        poses, truth = (np.stack([d[n] for n in names]) for d in (found, self.truth))
+        angles, distances = pose_errors(poses, truth, (periods == reference) | (reference is None))
         every = camera_centre(np.stack(list(self.truth.values())))
-        extent = float(np.linalg.norm(np.ptp(every, axis=0)))
-        rotation = sim.matrix / sim.scale
-        result = {}
-        for period in sorted(set(self.periods.values())):
-            mine = [n for n in names if self.periods[n] == period]
-            angles, distances = [], []
-            for name in mine:
-                turned = found[name][:3, :3] @ rotation.T
-                cosine = (np.trace(turned @ self.truth[name][:3, :3].T) - 1) / 2
-                angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-                place = sim.apply(camera_centre(found[name])[None])[0]
-                distances.append(np.linalg.norm(place - camera_centre(self.truth[name])) / extent)
-            result[period] = (float(np.median(angles)), float(np.median(distances)))
-        return result
+        extent = np.linalg.norm(np.ptp(every, axis=0))
+        return {
+            p: (
+                float(np.median(angles[periods == p])),
+                float(np.median(distances[periods == p]) / extent),
+            )
+            for p in np.unique(periods).tolist()
+        }
 
 
 @pytest.fixture(scope="session")

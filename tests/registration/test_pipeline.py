@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.registration.generated import pose_errors
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.registration.context import Options
@@ -19,7 +20,6 @@ from chronoscene.registration.quality.rays import cross_matches
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.scene.similarity import fit
 from chronoscene.validation.run import validate_scene
 
 OPTIONS = Options(threads=1, max_features=3000)
@@ -54,22 +54,13 @@ def joint(captures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
 def errors(scene: Scene, truth: Scene, reference: int) -> tuple[float, float]:
     """Median rotation (degrees) and centre error (share of the extent) of the other period."""
     known = {f.name: f.cam_from_world for f in truth.frames}
-    poses = {Path(f.name).name: f.cam_from_world for f in scene.frames}
-    poses = {name: pose for name, pose in poses.items() if name in known}
-    fitted = [n for n in poses if n.startswith(f"p{reference}")]
-    sim = fit(
-        camera_centre(np.stack([poses[n] for n in fitted])),
-        camera_centre(np.stack([known[n] for n in fitted])),
-    )
-    assert sim is not None
+    found = {Path(f.name).name: f.cam_from_world for f in scene.frames}
+    names = sorted(found.keys() & known)
+    fitted = np.array([name.startswith(f"p{reference}") for name in names])
+    poses, right = (np.stack([d[name] for name in names]) for d in (found, known))
+    angles, distances = pose_errors(poses, right, fitted)
     extent = np.linalg.norm(np.ptp(camera_centre(np.stack(list(known.values()))), axis=0))
-    angles, distances = [], []
-    for name in poses.keys() - set(fitted):
-        turned = poses[name][:3, :3] @ (sim.matrix / sim.scale).T @ known[name][:3, :3].T
-        angles.append(np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))))
-        place = sim.apply(camera_centre(poses[name])[None])[0]
-        distances.append(np.linalg.norm(place - camera_centre(known[name])) / extent)
-    return float(np.median(angles)), float(np.median(distances))
+    return float(np.median(angles[~fitted])), float(np.median(distances[~fitted]) / extent)
 
 
 def test_a_scene_comes_out(joint: tuple[Path, Registered], truth: Scene) -> None:
