@@ -55,6 +55,9 @@ class Case:
             "threads": 1,
         } | self.extra
 
+    def run(self, route: Callable[..., dict[str, Any]]) -> dict[str, Any]:
+        return route(self.arguments(), lambda *_: None)
+
     def estimated(self) -> dict[str, Array]:
         return {i.name: i.cam_from_world for i in read_model(self.folder / "model").images}
 

@@ -9,20 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.registration.generated import pose_errors
 from chronoscene.colmap.model import read_model
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import verified_matches
 from chronoscene.registration.reconstruct.alignment import Alignment
 from chronoscene.registration.reconstruct.candidates import CERTAIN_INLIERS, support, weak_pairs
 from chronoscene.registration.reconstruct.routes import joint
-from chronoscene.scene.geometry import camera_centre, look_at
-from chronoscene.scene.similarity import Sim3, fit
+from chronoscene.scene.geometry import look_at
+from chronoscene.scene.similarity import Sim3
 
 Array = NDArray[np.float64]
-
-
-def silent(what: str, done: int, total: int) -> None:
-    """No progress."""
 
 
 def street(count: int) -> tuple[list[Array], Array, list[NDArray[np.bool_]]]:
@@ -60,23 +57,19 @@ def test_a_walk_along_a_street_is_mapped(
 ) -> None:
     poses, points, sees = street(12)
     arguments = write_database(tmp_path, poses, points, sees, CAMERA)
-    result = joint(
-        arguments | {"focals": dict.fromkeys(arguments["periods"], (800.0, 0.02))}, silent
-    )
+    arguments["focals"] = dict.fromkeys(arguments["periods"], (800.0, 0.02))
+    result = joint(arguments, lambda *_: None)
     assert result["model"]["images"] == len(poses)
     assert any("short tracks" in r for r in result["remarks"])
     found = {i.name: i.cam_from_world for i in read_model(Path(arguments["out"])).images}
-    pairs = [(found[n], p) for n, p in zip(sorted(found), poses, strict=True)]
-    a, b = (np.stack(x) for x in zip(*pairs, strict=True))
-    similarity = fit(camera_centre(a), camera_centre(b))
-    assert similarity is not None
-    moved = np.linalg.norm(similarity.apply(camera_centre(a)) - camera_centre(b), axis=1)
+    model = np.stack([found[name] for name in sorted(found)])
+    _, moved = pose_errors(model, np.stack(poses), np.ones(len(poses), bool))
     assert moved.max() < 0.01 * 2.5 * len(poses)
 
 
 def test_support_falls_with_every_wrong_pose(make_case: Callable[..., Any]) -> None:
     case = make_case()
-    joint(case.arguments(), silent)
+    case.run(joint)
     model = pycolmap.Reconstruction(str(case.folder / "model"))
     _, matches = verified_matches(case.database)
     right = support(model, matches)

@@ -19,10 +19,6 @@ FOCAL, SIZE = 800.0, (1000, 750)
 HEIGHT = 50.0
 
 
-def silent(what: str, done: int, total: int) -> None:
-    """No progress."""
-
-
 def flight(
     write_database: Callable[..., dict[str, Any]],
     folder: Path,
@@ -74,13 +70,13 @@ def test_a_stated_focal_length_is_held_where_flat_ground_leaves_it_open(
     tmp_path: Path, write_database: Callable[..., Any]
 ) -> None:
     free = flight(write_database, tmp_path / "free", "SIMPLE_RADIAL", LENS, FOCAL)
-    joint(free, silent)
+    joint(free, lambda *_: None)
     focal, height = found(free)
     assert abs(focal / FOCAL - 1) > 0.25  # so the case is one
     assert abs(height / HEIGHT - 1) > 0.25
     stated = flight(write_database, tmp_path / "stated", "SIMPLE_RADIAL", LENS, FOCAL)
     stated["focals"] = dict.fromkeys(stated["periods"], (FOCAL, 0.005))
-    result = joint(stated, silent)
+    result = joint(stated, lambda *_: None)
     focal, height = found(stated)
     assert result["held"] and focal == FOCAL
     assert height == pytest.approx(HEIGHT, rel=0.07)
@@ -92,7 +88,7 @@ def test_a_full_model_of_the_lens_gives_focal_length_and_height(
 ) -> None:
     monkeypatch.setattr("chronoscene.registration.reconstruct.lens.MIN_PHOTOS", 12)
     case = flight(write_database, tmp_path, "SIMPLE_RADIAL", LENS, FOCAL)
-    result = joint(case | {"full_lens": True}, silent)
+    result = joint(case | {"full_lens": True}, lambda *_: None)
     focal, height = found(case)
     assert focal == pytest.approx(FOCAL, rel=0.03)
     assert height == pytest.approx(HEIGHT, rel=0.03)
@@ -103,7 +99,7 @@ def test_a_wrong_focal_length_in_the_metadata_does_no_harm(make_case: Callable[.
     case = make_case(points=150)
     camera = read_camera(case.database)
     case.extra = {"focals": dict.fromkeys(case.periods, (0.7 * camera, 0.02))}
-    result = joint(case.arguments(), silent)
+    result = case.run(joint)
     assert not result["held"]
     assert any("it is needed" in r for r in result["remarks"])
     assert all(degrees < 0.1 and share < 0.002 for degrees, share in case.errors().values())

@@ -122,15 +122,10 @@ def test_up_is_not_down_when_the_world_is_turned_over() -> None:
 def test_priors_are_as_uncertain_along_each_axis_as_their_residuals(
     make_scene_folder: Callable[..., Path],
 ) -> None:
-    names = [f"{i:02d}.png" for i in range(40)]
-    folder = make_scene_folder(dict.fromkeys(names, 0), tests=[])
-    model = read_reconstruction(folder / "sparse" / "0")
+    model, centres = as_model(make_scene_folder)
     noise = np.random.default_rng(10).normal(0, 0.5, (40, 3))
-    enu = {
-        str(image.name): (100 * np.asarray(image.projection_center()) + noise[i]).tolist()
-        for i, image in enumerate(model.images.values())
-    }
-    moved, priors = to_gps_frame(model, Priors(enu, dict.fromkeys(names, [0.01] * 3)), [])
+    enu = {n: (c + e).tolist() for (n, c), e in zip(centres.items(), noise, strict=True)}
+    moved, priors = to_gps_frame(model, Priors(enu, dict.fromkeys(enu, [0.01] * 3)), [])
     assert moved and len(priors.sigma) > 35
     np.testing.assert_allclose(list(priors.sigma.values()), 0.5, rtol=0.25)
 
