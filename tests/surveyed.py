@@ -11,6 +11,7 @@ from chronoscene.harness.use.changes import back_project
 from chronoscene.methods import Prediction
 from chronoscene.scene import Camera, Frame, Period, Points, Scene, WorldFrame
 from chronoscene.scene.geometry import camera_centre, look_at
+from chronoscene.scene.similarity import Sim3
 
 LOW, HIGH = np.array([2.0, -1.0, 0.0]), np.array([6.0, 4.0, 3.0])
 """Corners of the box of period 1: 4 x 5 x 3 m, off the middle in both directions."""
@@ -89,11 +90,9 @@ class ToyRun:
 
 def moved(scene, shift, **world):
     """The scene in a world whose origin is elsewhere."""
-    shift = np.asarray(shift)
-    frames = []
-    for frame in scene.frames:
-        pose = frame.cam_from_world.copy()
-        pose[:3, 3] -= pose[:3, :3] @ shift
-        frames.append(replace(frame, cam_from_world=pose))
-    points = replace(scene.points, xyz=scene.points.xyz + shift)
-    return replace(scene, frames=tuple(frames), points=points, world=WorldFrame("metre", **world))
+    move = Sim3(1.0, np.eye(3), np.asarray(shift))
+    frames = tuple(
+        replace(f, cam_from_world=move.apply_to_pose(f.cam_from_world)) for f in scene.frames
+    )
+    points = replace(scene.points, xyz=move.apply(scene.points.xyz))
+    return replace(scene, frames=frames, points=points, world=WorldFrame("metre", **world))

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from surveyed import moved
 
 from chronoscene.colmap.binary import read_images, read_points
 from chronoscene.colmap.model import (
@@ -146,18 +147,11 @@ def test_binary_wins_over_text(make_scene_folder):
 
 def test_large_coordinates_keep_their_digits(make_scene_folder, tmp_path):
     """A model in projected coordinates: 0.1 mm is kept at 4 000 km from the origin."""
-    scene = read_scene(make_scene_folder())
-    offset = np.array([442_000.0, 4_427_000.0, 50.0])
-    frames = []
-    for frame in scene.frames:
-        pose = frame.cam_from_world.copy()
-        pose[:3, 3] -= pose[:3, :3] @ offset
-        frames.append(replace(frame, cam_from_world=pose))
-    points = replace(scene.points, xyz=scene.points.xyz + offset)
-    write_model(tmp_path, frames, points)
+    scene = moved(read_scene(make_scene_folder()), [442_000.0, 4_427_000.0, 50.0])
+    write_model(tmp_path, scene.frames, scene.points)
     model = read_model(tmp_path)
-    np.testing.assert_array_equal(model.points.xyz, points.xyz)
-    for image, frame in zip(model.images, frames, strict=True):
+    np.testing.assert_array_equal(model.points.xyz, scene.points.xyz)
+    for image, frame in zip(model.images, scene.frames, strict=True):
         np.testing.assert_allclose(image.cam_from_world, frame.cam_from_world, rtol=1e-14)
 
 
