@@ -161,7 +161,8 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     # Control that could not move the model is as independent as check points.
     checks = [r for r in points if r.role == "check" or not controlled]
     used = [r for r in points if r.used]
-    found, control, gps = _of_points(checks), _of_points(used), _against_gps(model)
+    found, control = _of_points(checks), _of_points(used)
+    gps = None if model.georeference is None else _rmse(*_gps_errors(model))
     without = errors_left_out(model)
     left_out = _rmse(list(without), np.array([error for error, _ in without.values()]))
     pixels = [r.ground_pixel for r in points if r.ground_pixel is not None]
@@ -232,10 +233,6 @@ def _rmse(names: Sequence[str], errors: Array) -> Rmse | None:
         worst=names[worst],
         largest=float(distance[worst]),
     )
-
-
-def _against_gps(model: Registered) -> Rmse | None:
-    return None if model.georeference is None else _rmse(*_gps_errors(model))
 
 
 def _gps_errors(model: Registered) -> tuple[list[str], Array]:
