@@ -25,7 +25,7 @@ SETTINGS = SynthSettings(
 )
 
 IMAGES = 8
-"""Label of each period."""
+"""Photos of each period."""
 
 
 @dataclass

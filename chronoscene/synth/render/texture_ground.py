@@ -176,7 +176,7 @@ def soil(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 @inner
 def fields(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
-    """Countryside in world axes: parcels with furrows, hedges, woods. Numbers: litness."""
+    """Countryside in world axes: parcels with furrows, hedges, woods."""
     c0, c1, c2 = colors(s)
     wx = x + 9.0 * fbm(x, y, 60.0, 2, seed + 1, 0.01)
     wy = y + 9.0 * fbm(y, x, 60.0, 2, seed + 2, 0.01)

@@ -64,7 +64,7 @@ def brick(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 @inner
 def panel(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
-    """Cladding panels with dark joints (c2). Numbers: width, height, share of c1, gloss bands."""
+    """Cladding panels with dark joints (c2). Numbers: width, height, share of c1."""
     c0, c1, c2 = colors(s)
     col, row = math.floor(u / s[10]), math.floor(v / s[11])
     seen = fade(min(s[10], s[11]), fw)
