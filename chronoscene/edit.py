@@ -335,9 +335,9 @@ def _merged(
     merged: list[Period] = []
     number: dict[int, int] = {}
     for i, (key, group) in enumerate(groups.items()):
-        first = group[0]
-        unnamed = first.label == str(first.id)
-        label = key if isinstance(key, str) else str(i) if unnamed else first.label
+        label = key if isinstance(key, str) else group[0].label
+        if any(p.label == label == str(p.id) for p in group):
+            label = str(i)  # an id in place of a label follows the new numbers
         merged.append(Period(i, label, _common_date([p.date for p in group])))
         number |= {p.id: i for p in group}
     return tuple(merged), number

@@ -153,6 +153,10 @@ def test_ids_as_labels_follow_the_numbers(make_scene_folder):
         Period(0, "0"),
         Period(1, "1"),
     )
+    assert apply(scene, Edits(rename={"0": "1"})).scene.periods == (
+        Period(0, "0"),  # of 0 and 1
+        Period(1, "1"),
+    )
 
 
 @pytest.mark.parametrize(
