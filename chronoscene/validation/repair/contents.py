@@ -229,9 +229,11 @@ def repair_test(
     """Corrected lines of ``test.txt``; unchanged if none is an image of the model."""
     index, spellings = NameIndex(names), Spellings(names)
     lines: dict[str, None] = {}
-    unknown = renamed = 0
+    known = set(names)
+    unknown = renamed = short = 0
     for entry in entries:
         fits = index.find(entry.name)
+        short += len(fits) == 1 and entry.name not in known
         for text in (entry.name, entry.name.rsplit(maxsplit=1)[0]):  # some append the period
             if not fits and (name := _meant(spellings, text)) is not None:
                 fits, renamed = [name], renamed + 1
@@ -242,6 +244,7 @@ def repair_test(
     if not lines:
         return [entry.name for entry in entries], []
     repairs: list[Repair] = []
+    _note(repairs, "", short, "name", "in test.txt written in full")
     _note(repairs, "CS324", renamed, "name", "corrected as in the model")
     _note(repairs, "CS324", unknown, "line", "on images that are not in the model removed")
     _note(repairs, "", len(entries) - unknown - len(lines), "repeated line", "removed")

@@ -158,7 +158,12 @@ class _Fix:
         text = self._find_text(TEST, TEST_ELSEWHERE, "CS322")
         if text is None or names is None:
             return
-        lines, repairs = contents.repair_test(names, parse_test_text(text.text))
+        entries = parse_test_text(text.text)
+        lines, repairs = contents.repair_test(names, entries)
+        plain = "\n".join(entry.name for entry in entries)
+        if text.data.removesuffix(b"\n") != plain.encode():
+            what = "test.txt saved as UTF-8 with Unix line endings, without needless blanks"
+            repairs.append(Repair("", what))
         if self._write(TEST, "".join(f"{line}\n" for line in lines)):
             self._repairs += repairs
 

@@ -181,7 +181,8 @@ def test_fix_reports_what_it_did_and_what_remains(warned, tmp_path):
     arguments = ["validate", str(warned), "--fix", str(tmp_path / "fixed")]
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 1
-    assert "fixed: 1 correction\n  CS324: 1 line on images that are not in" in result.stderr
+    expected = "fixed: 2 corrections\n  also: 2 names in test.txt written in full\n  CS324: 1 line "
+    assert expected in result.stderr
     assert "CS201" in result.stdout and "CS324" not in result.stdout
     assert (tmp_path / "fixed/sparse/0/test.txt").read_text() == "a3.png\nb3.png\n"
 

@@ -172,6 +172,24 @@ def test_test_list(scene, fix, case):
     assert (out / TEST).read_text() == "a003.png\nb003.png\n"
 
 
+@pytest.mark.parametrize(
+    ("text", "repair"),
+    [
+        ("a003\nb003.png\n", "1 name in test.txt written in full"),
+        (
+            "\ufeffa003.png\r\n\r\nb003.png",
+            "test.txt saved as UTF-8 with Unix line endings, without needless blanks",
+        ),
+    ],
+)
+def test_changes_of_the_test_list_are_listed(scene, tmp_path, text, repair):
+    scene.to_binary()
+    scene.write(TEST, text.encode())
+    assert fix_scene(scene.root, tmp_path / "fixed") == [("", repair)]
+    assert (tmp_path / "fixed" / TEST).read_bytes() == b"a003.png\nb003.png\n"
+    assert fix_scene(tmp_path / "fixed", tmp_path / "again") == []
+
+
 def test_misplaced_test_list(scene, fix):
     scene.path(TEST).rename(scene.path("test.txt"))
     fixed, after, out = fix()
