@@ -23,7 +23,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import DetectedFormat
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, read_periods
 from chronoscene.formats.shared.colmap_layout import Assigned
-from chronoscene.images.masks import MASKS, mask_name
+from chronoscene.images.masks import MASKS, mask_name, mask_place
 from chronoscene.io.documents import decode_text
 from chronoscene.scene import Camera, Period, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
@@ -325,7 +325,10 @@ class RawScene:
 
     @cached_property
     def files(self) -> list[str]:
-        """Files below ``images/`` with an image extension, as relative names, sorted."""
+        """Files below ``images/`` with an image extension, as relative names, sorted.
+
+        Folders that are links are not looked into.
+        """
         return _image_files(self.root / "images")
 
     def image_path(self, name: str) -> Path:
@@ -353,14 +356,18 @@ class RawScene:
 
     @cached_property
     def mask_files(self) -> list[str]:
-        """Files below ``masks/`` with an image extension, as relative names, sorted."""
+        """Files below ``masks/`` with an image extension, as relative names, sorted.
+
+        Folders that are links are not looked into.
+        """
         return _image_files(self.root / MASKS)
 
     @cached_property
     def mask_headers(self) -> dict[str, Header]:
         """Headers of the masks of present images, by the names of the images."""
-        masks = set(self.mask_files)
-        masked = {n: mask_name(n) for n in self.present if mask_name(n) in masks}
+        # Not those of `mask_files`, which lacks what is in folders that are links.
+        there = (n for n in self.present if os.path.lexists(self.root / mask_place(n)))
+        masked = {name: mask_name(name) for name in there}
         headers = pixels.read_headers(self.root / MASKS, list(masked.values()))
         return {name: headers[mask] for name, mask in masked.items()}
 

@@ -248,6 +248,19 @@ def test_a_mask_of_another_size(masked):
     assert any(f.expected == "64 x 48 as images/b001.png" for f in report.findings)
 
 
+def test_masks_in_a_folder_that_is_a_link(scene, tmp_path):
+    for place in ("sparse/0/images.txt", "sparse/split.txt"):
+        scene.replace(place, "b001.png", "x/b001.png")
+    for place in ("images/x", "masks"):
+        scene.path(place).mkdir()
+    scene.path("images/b001.png").rename(scene.path("images/x/b001.png"))
+    (tmp_path / "elsewhere").mkdir()
+    scene.path("masks/x").symlink_to(tmp_path / "elsewhere")
+    save_mask(scene, "x/b001.png", Image.new("L", (32, 24), 255))
+    place = "masks/x/b001.png.png"
+    scene.expect("CS242", place=place, found="32 x 24", also=["CS245", "CS703"])
+
+
 @pytest.mark.parametrize(
     ("file", "hint"),
     [
