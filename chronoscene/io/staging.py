@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import chain
 from pathlib import Path, PureWindowsPath
 
 from chronoscene.errors import ConfigError, DiskFullError, SceneError
@@ -236,7 +237,7 @@ def alone_in(folder: Path, option: str) -> Iterator[None]:
 
 
 def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> None:
-    """Refuse to write into the folder of a scene, or into folders that it links to.
+    """Refuse to write into the folder of a scene, or into folders that are linked below it.
 
     Args:
         place: Where something is to be written.
@@ -244,12 +245,11 @@ def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> N
         option: Option by which the user gave the place.
 
     Raises:
-        ConfigError: If the place is in one of the folders, or in the target of a link in one.
+        ConfigError: If the place is in one of the folders, or in the target of a link below one.
     """
     resolved = place.resolve()
     for scene in scenes:
-        linked = [path for path in _entries(scene) if path.is_symlink() and path.is_dir()]
-        for folder in (scene, *linked):
+        for folder in chain([scene], _linked_folders(scene)):
             if resolved.is_relative_to(folder.resolve()):
                 raise ConfigError(
                     f"{option} {place}".strip(),
@@ -259,9 +259,12 @@ def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> N
                 )
 
 
-def _entries(folder: Path) -> list[Path]:
-    """List the contents of a folder; nothing if it cannot be read."""
-    try:
-        return sorted(folder.iterdir())
-    except OSError:
-        return []
+def _linked_folders(top: Path) -> Iterator[Path]:
+    """Find the links to folders below a folder, at any depth, but not those to folders above it.
+
+    They are not looked into.
+    """
+    around = top.resolve()
+    for above, folders, _ in os.walk(top):
+        links = (p for name in sorted(folders) if (p := Path(above) / name).is_symlink())
+        yield from (path for path in links if not around.is_relative_to(path.resolve()))

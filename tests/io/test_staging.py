@@ -77,11 +77,13 @@ def test_a_file_that_cannot_be_put_in_place_leaves_nothing(tmp_path):
         write_text_atomic(tmp_path / "absent" / "a.txt", "text")
 
 
-def test_what_a_scene_links_to_is_inside_of_it(tmp_path):
+@pytest.mark.parametrize("link", ["images", "images/2016"])
+def test_what_a_scene_links_to_is_inside_of_it(tmp_path, link):
     scene, photos = tmp_path / "scene", tmp_path / "photos"
-    scene.mkdir()
     photos.mkdir()
-    (scene / "images").symlink_to(photos)
+    (scene / link).parent.mkdir(parents=True)
+    (scene / link).symlink_to(photos)
+    (scene / "up").symlink_to(tmp_path)
     check_outside(tmp_path / "out", [scene])
     for place in (scene, scene / "out", photos, photos / "new" / "out"):
         with pytest.raises(ConfigError, match="expected a place outside the scene, found one in"):
