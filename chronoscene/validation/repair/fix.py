@@ -180,7 +180,7 @@ class _Fix:
         return text
 
     def _misspelt_images(self) -> None:
-        """Rename files whose name differs from that in the model only by case or Unicode form."""
+        """Rename files whose name differs from that in the model only by its `spelling`."""
         registered, present = set(self._scene.names), set(self._scene.present)
         by_spelling = grouped((spelling(file), file) for file in self._scene.files)
         renamed = []

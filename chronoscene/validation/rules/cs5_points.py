@@ -1,5 +1,4 @@
-"""CS501 to CS505, CS509, CS510, CS514, CS517, CS518, CS522, CS525: sparse points and their
-tracks."""
+"""CS501 to CS505, CS509, CS510, CS514, CS518, CS522, CS525: sparse points and their tracks."""
 
 from __future__ import annotations
 
