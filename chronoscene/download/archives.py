@@ -22,6 +22,7 @@ from chronoscene.io.staging import leads_out, staged_folder
 from chronoscene.io.wording import quote
 
 ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz")
+METADATA = "__MACOSX/"  # Folder that macOS adds to zip archives, with a shadow of each file
 _BROKEN = (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, RuntimeError)
 """Errors of the libraries for damage, and for unknown ways of packing."""
 
@@ -45,7 +46,7 @@ def archive_stem(path: str) -> str:
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[list[Member]]:
-    """Open an archive and list its files, in their order there.
+    """Open an archive and list its files, in their order there, without metadata of macOS.
 
     Raises:
         DownloadError: If it is damaged or of another kind, or has members that a dataset has no use
@@ -55,7 +56,8 @@ def open_archive(path: Path) -> Iterator[list[Member]]:
         if path.suffix == ".zip":
             with zipfile.ZipFile(path) as packed:
                 infos = [info for info in packed.infolist() if not info.is_dir()]
-                yield [_zip_member(path, packed, info) for info in infos]
+                found = [_zip_member(path, packed, info) for info in infos]
+                yield [member for member in found if not member.name.startswith(METADATA)]
         else:
             with tarfile.open(path) as unpacked:
                 members = [info for info in unpacked.getmembers() if not info.isdir()]

@@ -8,6 +8,8 @@ import zipfile
 import pytest
 
 from chronoscene.download.archives import archive_stem, open_archive, unpack_scene
+from chronoscene.download.catalogue import DATASETS
+from chronoscene.download.datasets import find_scenes
 from chronoscene.errors import DiskFullError, DownloadError
 
 
@@ -45,6 +47,13 @@ def test_unpacks_one_folder(tmp_path, name, make):
         "sparse/split.txt": b"1",
         "b": b"2",
     }
+
+
+def test_metadata_of_macos_is_no_scene(tmp_path):
+    make_zip(tmp_path / "a.zip", {"A/t0/a.jpg": b"1", "__MACOSX/A/t0/._a.jpg": b"2"})
+    with open_archive(tmp_path / "a.zip") as members:
+        names = [member.name for member in members]
+    assert find_scenes(DATASETS["cl-splats"], names, "a") == {"A": "A/"}
 
 
 @pytest.mark.parametrize("make", [make_zip, make_tar])
