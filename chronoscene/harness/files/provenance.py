@@ -7,6 +7,7 @@ import json
 import platform
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,12 +27,28 @@ def scene_hash(scene: Scene) -> str:
 
     Poses are rounded to nine digits: what pycolmap returns may differ in the last one.
     """
+    return _hash(scene, sha256_of)
+
+
+def scene_stamp(scene: Scene) -> str:
+    """Hash as `scene_hash`, with size and time of change of each file instead of its content."""
+    return _hash(scene, _stamp_of)
+
+
+def _stamp_of(path: Path) -> str:
+    status = path.stat()
+    return f"{status.st_size} {status.st_mtime_ns}"
+
+
+def _hash(scene: Scene, describe: Callable[[Path], str]) -> str:
+    """Hash a scene, with what `describe` finds of each image and mask."""
     digest = hashlib.sha256()
     for frame in scene.frames:
         camera = frame.camera
         line = [frame.name, frame.period, frame.split, camera.model, camera.width, camera.height]
         files = filter(None, (scene.image_path(frame), scene.masks.get(frame.name)))
-        digest.update(json.dumps([*line, *camera.params, *map(_file_hash, files)]).encode())
+        found = [_described(path, describe) for path in files]
+        digest.update(json.dumps([*line, *camera.params, *found]).encode())
         digest.update((np.round(frame.cam_from_world, 9) + 0.0).tobytes())
     points = scene.points
     for array in (points.xyz, points.rgb, points.track_start, points.track_frame):
@@ -39,9 +56,9 @@ def scene_hash(scene: Scene) -> str:
     return digest.hexdigest()
 
 
-def _file_hash(path: Path) -> str:
+def _described(path: Path, describe: Callable[[Path], str]) -> str:
     try:
-        return sha256_of(path)
+        return describe(path)
     except OSError as error:
         raise ImageError(
             path,

@@ -10,11 +10,13 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from chronoscene.errors import SceneError
 from chronoscene.harness.files.predictions import safe_part
-from chronoscene.harness.files.provenance import config_hash
+from chronoscene.harness.files.provenance import config_hash, scene_hash, scene_stamp
 from chronoscene.harness.files.records import Failure
 from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.settings import RunSettings
+from chronoscene.scene import Scene
 
 LOCKS = ".locks"  # Folder beside the results, with a file for each run
 
@@ -35,6 +37,8 @@ class Job:
     settings: RunSettings
     """The overrides are those of this method."""
     notices: list[str] = field(default_factory=list)
+    scene_stamp: str = ""
+    """Stamp of the files that `scene_hash` was computed from."""
     staging: str = ""
     """Folder that the worker writes; renamed to `folder` when it has ended."""
     continued_from: list[int] = field(default_factory=list)
@@ -59,6 +63,25 @@ class Job:
         """Return the job as plain data for JSON."""
         document: dict[str, Any] = _adapter().dump_python(self, mode="json")
         return document
+
+    def read_scene(self) -> Scene:
+        """Read the scene of the run.
+
+        Files are read only if their sizes or times of change differ from those of the plan, as on
+        another machine.
+
+        Raises:
+            SceneError: If it cannot be read, or has changed since the run was planned.
+        """
+        scene = self.origin.read_scene()
+        if scene_stamp(scene) != self.scene_stamp and scene_hash(scene) != self.scene_hash:
+            raise SceneError(
+                scene.root,
+                expected="the images, masks and model of which the run was planned",
+                found="changes since then",
+                todo="run the same command again, which plans with the present files",
+            )
+        return scene
 
     def with_settings(self, **changes: Any) -> Job:
         """Return the job with other values of some of its `RunSettings`."""

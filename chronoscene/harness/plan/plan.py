@@ -114,6 +114,7 @@ def _runs_of_scene(
             ),
             scene=scene.content.name,
             scene_hash=scene.hash,
+            scene_stamp=scene.stamp,
             split_hash=scene.split_hash,
             method_name=method.spec.name,
             strategy=strategy,

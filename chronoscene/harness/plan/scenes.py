@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from chronoscene.errors import ConfigError
-from chronoscene.harness.files.provenance import scene_hash
+from chronoscene.harness.files.provenance import scene_hash, scene_stamp
 from chronoscene.harness.files.source import read_bench_scene
 from chronoscene.harness.plan.memory import PhotoNeeds, photo_needs
 from chronoscene.harness.plan.parts import check_points, check_scene
@@ -24,6 +24,8 @@ class BenchScene:
     period_by: str | None
     """Rule by which its images were grouped into periods."""
     hash: str
+    stamp: str
+    """Stamp of its files, taken before the hash."""
     split_hash: str
     needs: PhotoNeeds
 
@@ -54,4 +56,5 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
     for scene, period_by in scenes.values():
         log(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
         needs = photo_needs(scene, settings.run)
-        yield BenchScene(scene, period_by, scene_hash(scene), split_hash(scene), needs)
+        stamp = scene_stamp(scene)
+        yield BenchScene(scene, period_by, scene_hash(scene), stamp, split_hash(scene), needs)

@@ -65,7 +65,7 @@ def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> Non
     job, spec = run.job, run.spec
     settings, staging = job.settings, Path(job.staging)
     write_text_atomic(staging / records.CONFIG_FILE, json.dumps(run.document, indent=1) + "\n")
-    scene = job.origin.read_scene()
+    scene = job.read_scene()
     parts = make_parts(
         scene, ImageStore(scene, max_width=settings.max_width, memory_limit=0), job.strategy
     )

@@ -101,7 +101,7 @@ def run_job(job: Job, report: Report | None = None) -> None:
     settings = job.settings
     machine = Machine(pick_device(settings.device, run.spec), set_threads(settings.threads))
     write_text_atomic(staging / records.CONFIG_FILE, dumps(run.document, indent=1) + "\n")
-    scene = job.origin.read_scene()
+    scene = job.read_scene()
     takes_period = run.spec.period_input != "none"
     store = open_store(scene, settings)
     parts = make_parts(scene, store, job.strategy, takes_period=takes_period)

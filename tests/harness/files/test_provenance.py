@@ -1,5 +1,6 @@
 """Hashes change with what they name and with nothing else; the commit is that of this code."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -59,6 +60,15 @@ def test_changes_of_pixels_change_the_hash(scene):
     data[-1] ^= 1
     path.write_bytes(data)
     assert provenance.scene_hash(scene) != before
+
+
+def test_stamps_need_no_content(scene, monkeypatch):
+    before = provenance.scene_stamp(scene)
+    monkeypatch.setattr(Path, "open", None)
+    monkeypatch.setattr(provenance, "sha256_of", None)
+    assert provenance.scene_stamp(scene) == before
+    os.utime(scene.image_path(scene.frames[0]), (1, 1))
+    assert provenance.scene_stamp(scene) != before
 
 
 def test_masks_change_the_hash(scene, tmp_path):

@@ -1,5 +1,6 @@
 """Runs of real methods through the harness, in this process."""
 
+import os
 import shutil
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from PIL import Image
 from chronoscene.errors import BackendError
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.harness.files.records import read_run
+from chronoscene.harness.plan import plan
 from chronoscene.harness.report.summary import read_runs
 from chronoscene.harness.report.tables import format_runs
 from chronoscene.harness.train.worker import pick_device
@@ -100,6 +102,29 @@ def test_a_scene_with_masks_is_trained_and_scored_by_what_counts(
         assert len(list((tmp_path / f"runs{k}/ground_truth").rglob("*.mask.png"))) == 3
     assert results[0][0] == results[1][0]
     assert results[0][1] == results[1][1] and results[0][2] != results[1][2]
+
+
+@pytest.mark.parametrize("changed", ["photo", "time alone"])
+def test_a_run_is_recorded_only_with_the_photos_of_its_plan(
+    scene_folder, tmp_path, bench_here, monkeypatch, changed
+):
+    folder = shutil.copytree(scene_folder, tmp_path / "new/ring")
+    freeze = plan.freeze_ground_truth
+
+    def change_after(*arguments):
+        freeze(*arguments)
+        if changed == "photo":
+            Image.effect_noise((24, 16), 90).convert("RGB").save(folder / "images/a/0.png")
+        os.utime(folder / "images/a/0.png", (1, 1))
+
+    monkeypatch.setattr(plan, "freeze_ground_truth", change_after)
+    outcome, _ = bench_here("MEAN", scenes=(folder,), iterations=2)
+    assert len(outcome.finished) == (changed != "photo")
+    for failure in outcome.failures:
+        assert failure.reason == (
+            f"{folder}: expected the images, masks and model of which the run was planned, found "
+            "changes since then; run the same command again, which plans with the present files"
+        )
 
 
 def poison(monkeypatch, numbers):
