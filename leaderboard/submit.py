@@ -15,6 +15,7 @@ from chronoscene.harness.files.predictions import read_manifest, write_manifest
 from chronoscene.harness.files.records import (
     PREDICTIONS,
     RUN_FILE,
+    no_runs,
     read_rows,
     read_run,
     run_folders,
@@ -99,7 +100,7 @@ def _runs_of(folder: Path) -> list[Path]:
     if (folder / RUN_FILE).is_file():
         return [folder]
     if not (found := run_folders(folder)):
-        read_run(folder)  # says what is missing
+        raise no_runs(folder, "no finished run in it")
     return found
 
 

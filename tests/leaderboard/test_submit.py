@@ -100,7 +100,7 @@ def test_a_run_with_changed_means_is_refused(make_run, tmp_path):
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):
-    with pytest.raises(CheckpointError, match="expected a finished run, found no such file"):
+    with pytest.raises(CheckpointError, match=r"expected a folder of runs.*run bench first"):
         submit([tmp_path], tmp_path / "entries")
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -324,6 +325,18 @@ def damaged(path: Path, found: str) -> CheckpointError:
 def run_folders(runs: Path) -> list[Path]:
     """Return the folders of all finished runs, sorted by path."""
     return sorted(p.parent for p in runs.glob(f"*/*/seed*/{RUN_FILE}") if _is_final(p.parent))
+
+
+def no_runs(folder: Path, found: str = "no run in it") -> CheckpointError:
+    """Make the error for a folder without runs; names the folder of runs that is near."""
+    todo = "run bench first"
+    for depth, inside in enumerate((f"*/seed*/{RUN_FILE}", f"seed*/{RUN_FILE}", RUN_FILE), 1):
+        if any(folder.glob(inside)):
+            todo = f"name {os.path.normpath(folder.joinpath(*[os.pardir] * depth))}"
+    if below := sorted(folder.glob(f"*/*/*/seed*/{RUN_FILE}")):
+        todo = f"name {below[0].parents[3]}"
+    expected = "a folder of runs, with SCENE/METHOD/seed0 in it"
+    return CheckpointError(folder, expected=expected, found=found, todo=todo)
 
 
 def read_failures(runs: Path) -> list[Failure]:

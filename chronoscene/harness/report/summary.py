@@ -15,8 +15,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from chronoscene.arrays import Array
-from chronoscene.errors import CheckpointError, ConfigError
-from chronoscene.harness.files.records import Failure, RunRecord, read_failures, run_folders
+from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import (
+    Failure,
+    RunRecord,
+    no_runs,
+    read_failures,
+    run_folders,
+)
 from chronoscene.harness.report.comparable import apart, each_once, scene_of
 from chronoscene.harness.report.differences import (
     SeedSpread,
@@ -170,9 +176,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
         found = [read_scored(path) for path in run_folders(folder)]
         failed = read_failures(folder)
         if not found and not failed:
-            raise CheckpointError(
-                folder, expected="a folder of runs", found="no run in it", todo="run bench first"
-            )
+            raise no_runs(folder)
         records += found
         failures += failed
     return apart(each_once(records)), failures

@@ -23,6 +23,7 @@ from chronoscene.harness.files.records import (
     RunRecord,
     Values,
     ViewScore,
+    no_runs,
     read_rows,
     read_run,
     read_with_rows,
@@ -324,9 +325,7 @@ def rescore(
     """
     folders = run_folders(runs)
     if not folders:
-        raise CheckpointError(
-            runs, expected="a folder of runs", found="no finished run in it", todo="run bench first"
-        )
+        raise no_runs(runs, "no finished run in it")
     outcomes: list[Rescored] = []
     readable = []
     for folder in folders:

@@ -34,6 +34,7 @@ from chronoscene.harness.files.records import (
     STAGES,
     RunRecord,
     ViewScore,
+    no_runs,
     read_config,
     read_lines,
     read_with_rows,
@@ -156,9 +157,7 @@ def verify(
     single = (runs / RUN_FILE).is_file()
     folders = [runs] if single else run_folders(runs)
     if not folders:
-        raise CheckpointError(
-            runs, expected="a folder of runs", found="no finished run in it", todo="run bench first"
-        )
+        raise no_runs(runs, "no finished run in it")
     summary = Summary(runs.resolve().parents[2] if single else runs)
     found = [Verified(str(folder)) for folder in folders]
     for run, folder in zip(found, folders, strict=True):

@@ -10,6 +10,7 @@ import pytest
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files.records import (
     ViewScore,
+    no_runs,
     read_rows,
     read_run,
     run_folders,
@@ -48,6 +49,19 @@ def test_the_summary_is_made_from_the_runs_alone(runs):
 def test_half_written_runs_are_not_runs(runs):
     (runs / JOINT).rename((runs / JOINT).with_name(".seed0.77.partial"))
     assert len(run_folders(runs)) == 3
+
+
+@pytest.mark.parametrize(
+    ("named", "meant"),
+    [("RUNS/ring", "RUNS"), (f"RUNS/{JOINT}/..", "RUNS"), (f"RUNS/{JOINT}", "RUNS"), (".", "RUNS"),
+     ("RUNS/ground_truth", None)],
+)  # fmt: skip
+def test_the_folder_of_runs_is_named_where_it_is_near(runs, monkeypatch, named, meant):
+    runs.rename(runs.with_name("RUNS"))
+    monkeypatch.chdir(runs.parent)
+    message = str(no_runs(Path(named)))
+    assert "expected a folder of runs, with SCENE/METHOD/seed0 in it, found no run" in message
+    assert message.endswith(f"name {meant}" if meant else "run bench first")
 
 
 @pytest.mark.parametrize(
