@@ -28,8 +28,8 @@ NOT_ASKED = "its scene was not named by --verify"
 NO_IMAGES = "no predictions beside it"
 NO_METHOD = "its method is not registered"
 NO_ENTRY = (
-    "no entry is of this scene as it is read without options; where bench had --period-by or "
-    "--dataset-format, name the scene that chronoscene convert makes with them"
+    "no entry is of this scene as it is read here; where bench had other --period-by or "
+    "--dataset-format, give these, or name the scene that chronoscene convert makes with them"
 )
 """Notice on a scene that was named in vain."""
 
@@ -56,7 +56,12 @@ class Board:
 
 
 def read_board(
-    folder: Path, scenes: Iterable[Path] = (), *, progress: Report | None = None
+    folder: Path,
+    scenes: Iterable[Path] = (),
+    *,
+    format: str | None = None,
+    period_by: str | None = None,
+    progress: Report | None = None,
 ) -> Board:
     """Read all entries below a folder, and score again those of some scenes.
 
@@ -66,15 +71,19 @@ def read_board(
     Args:
         folder: Folder of entries.
         scenes: Folders of scenes with the test photos to score against.
+        format: Argument of `read_scene` for all of them, as the next one.
+        period_by: Rule by which their images are grouped into periods.
         progress: Told how many entries are done.
 
     Raises:
         SceneError: If a scene cannot be read.
+        ConfigError: If a scene does not take the rule.
     """
     board = Board()
     found: dict[tuple[object, ...], tuple[Path, Standing]] = {}
     with tempfile.TemporaryDirectory() as temporary:
-        truths = _Truths(scenes, Path(temporary))
+        read = [(path, read_scene(path, format=format, period_by=period_by)) for path in scenes]
+        truths = _Truths(read, Path(temporary))
         files = entry_files(folder)
         for number, path in enumerate(files):
             if progress is not None:
@@ -125,12 +134,11 @@ def _stand(path: Path, entry: MeasuredEntry, truths: _Truths) -> Standing:
 class _Truths:
     """Scenes that entries are verified with, and their frozen test photos."""
 
-    def __init__(self, scenes: Iterable[Path], folder: Path) -> None:
+    def __init__(self, scenes: Iterable[tuple[Path, Scene]], folder: Path) -> None:
         self._folder = folder
         self._scenes: dict[tuple[str, str], Scene] = {}
         self._idle: dict[tuple[str, str], Path] = {}
-        for path in scenes:
-            scene = read_scene(path)
+        for path, scene in scenes:
             hashes = scene_hash(scene), split_hash(scene)
             self._scenes[hashes], self._idle[hashes] = scene, path
         self._scorers: dict[frozenset[str], Scorers] = {}

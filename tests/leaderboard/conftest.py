@@ -63,6 +63,12 @@ def honest(kept: Path, make_scene_folder: Callable[..., Path]) -> Path:
     return kept
 
 
+@pytest.fixture(scope="session")
+def noisy() -> Callable[..., None]:
+    """Writer of runs without scores."""
+    return write_noisy
+
+
 def write_noisy(runs: Path, scene, method: str, seed: int, *, noise: int) -> None:
     """A run without scores, whose predictions are photos with noise."""
     hashes = {"scene_hash": scene_hash(scene), "split_hash": split_hash(scene)}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import EXISTING_FOLDER, FOLDER, RUNS
+from chronoscene.cli.options import EXISTING_FOLDER, FOLDER, RUNS, reading_options, refuse_options
 from chronoscene.cli.output import check_place, report_written, say, writing_to
 from chronoscene.cli.progress import progress_bar
 from chronoscene.harness.report.published import load_published
@@ -48,6 +48,7 @@ def submit_command(folders: tuple[Path, ...], to: Path) -> None:
     help="Folder of a scene: the predictions of its entries are scored again, against its own test "
     "photos. May be repeated.",
 )
+@reading_options("the scenes of --verify")
 @click.option(
     "--runs",
     multiple=True,
@@ -56,7 +57,12 @@ def submit_command(folders: tuple[Path, ...], to: Path) -> None:
     "there. May be repeated.",
 )
 def leaderboard_command(
-    entries: Path, out: Path, scenes: tuple[Path, ...], runs: tuple[Path, ...]
+    entries: Path,
+    out: Path,
+    scenes: tuple[Path, ...],
+    dataset_format: str | None,
+    period_by: str | None,
+    runs: tuple[Path, ...],
 ) -> None:
     """Build the site of the leaderboard.
 
@@ -65,9 +71,17 @@ def leaderboard_command(
     values are not those of their predictions, are left out with a notice. Published figures are
     shown beside them. The site needs no server: open its index.html.
     """
+    if not scenes:
+        refuse_options(("dataset_format", "period_by"), "without --verify")
     check_place("--out", out)
     with progress_bar() as bar:
-        board = read_board(entries, scenes, progress=bar if scenes else None)
+        board = read_board(
+            entries,
+            scenes,
+            format=dataset_format,
+            period_by=period_by,
+            progress=bar if scenes else None,
+        )
     pictured = write_site(board.standings, load_published(), out, runs)
     for notice in board.notices:
         say(notice, fg="yellow")
