@@ -161,7 +161,7 @@ class _Truths:
 
     def scorers(self, entry: MeasuredEntry) -> Scorers:
         """Return the metrics that the runs of an entry have."""
-        names = frozenset(name for run in entry.runs for name in run.views[0].values)
+        names = frozenset(name for run in entry.runs for view in run.views for name in view.values)
         if names not in self._scorers:
             self._scorers[names] = make_scorers(names)
         return self._scorers[names]

@@ -55,6 +55,7 @@ class ScoredView(BaseModel):
     sha256: Sha256
     """Hash of the predicted image."""
     values: dict[str, float]
+    """Empty if the mask of the photo ignores every pixel."""
 
 
 class EntryRun(BaseModel):
@@ -221,10 +222,11 @@ def _check_numbers(record: RunRecord) -> None:
 
 def _check_views(views: tuple[ScoredView, ...]) -> None:
     known = all_metrics()
+    metrics = next((view.values.keys() for view in views if view.values), ())
     for view in views:
         if leads_out(view.view) or not view.view.isprintable() or len(view.view) > 200:
             raise ValueError("the name of a view leads out of its folder, or is no plain text")
-        if view.values.keys() != views[0].values.keys():
+        if view.values and view.values.keys() != metrics:
             raise ValueError("views with other metrics than the first one")
         if unknown := view.values.keys() - known.keys():
             raise ValueError(f"unknown metrics: {', '.join(sorted(unknown))[:100]!r}")

@@ -23,7 +23,6 @@ from chronoscene.harness.files.records import (
 from chronoscene.harness.score.regions import ALL
 from chronoscene.harness.score.scoring import score_folder
 from chronoscene.io.staging import needing_space, partial_name, write_text_atomic
-from chronoscene.io.wording import shown
 from chronoscene.metrics.registry import make_scorers
 from leaderboard.entries import (
     EntryRun,
@@ -116,15 +115,18 @@ def entry_run(folder: Path) -> EntryRun:
         if row.region == ALL and row.rendered_period == row.camera_period:
             values.setdefault(row.view, {})[row.metric] = row.value
     images = {i.view: i for i in manifest.images if i.rendered_period == i.camera_period}
-    if ignored := sorted(images.keys() - values.keys()):  # by their masks
-        raise refused(folder, f"no values of {shown(ignored)}: an entry has all test views")
-    if images.keys() != values.keys():
+    if not values.keys() <= images.keys():
         raise refused(folder, "other views in its rows than among its predictions")
     try:
         run = EntryRun(
             record=record.model_copy(update={"regions": {}, "stages": {}, "transfer": {}}),
             views=tuple(
-                ScoredView(view=view, period=i.camera_period, sha256=i.sha256, values=values[view])
+                ScoredView(
+                    view=view,
+                    period=i.camera_period,
+                    sha256=i.sha256,
+                    values=values.get(view, {}),  # none where the mask ignores every pixel
+                )
                 for view, i in images.items()
             ),
         )

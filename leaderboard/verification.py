@@ -63,8 +63,16 @@ def check_values(entry: Path, part: EntryRun, scores: Scores) -> None:
     """Compare the values of a run with computed ones, where there are any.
 
     Raises:
-        ConfigError: If one differs by more than `TOLERANCE`, or is that of the photo itself.
+        ConfigError: If one differs by more than `TOLERANCE`, or is that of the photo itself; or if
+            other views have values.
     """
+    given = {view.view for view in part.views if view.values}
+    scored = {row.view for row in scores.rows if row.region == ALL}
+    if scored and (wrong := sorted(given ^ scored)):
+        found = f"values of {wrong[0]!r}, whose mask ignores every pixel"
+        if wrong[0] in scored:
+            found = f"no values of {wrong[0]!r}, whose photo has pixels that count"
+        raise refused(entry, f"seed {part.record.seed}: {found}")
     stored = {(row.view, row.metric): row.value for row in part.rows}
     for row in scores.rows:
         value = stored.get((row.view, row.metric))
@@ -123,6 +131,7 @@ def _verified(label: str, part: EntryRun, run: Verified) -> Verified:
     stored = {
         view.view: {name: value for name, value in view.values.items() if name in found.metrics}
         for view in part.views
+        if view.values
     }
     # The means of an entry are those of its views, or it would have been refused.
     found.compare("views", stored, computed)

@@ -73,14 +73,13 @@ def test_a_value_without_its_image_is_refused(make_run, tmp_path):
         submit([run], tmp_path / "entries")
 
 
-def test_a_run_without_values_of_a_view_is_refused_with_its_name(make_run, tmp_path):
-    """Its mask ignores every pixel, so it is not scored."""
+def test_a_run_without_values_of_a_view_that_counts_is_refused(make_run, tmp_path):
     run = make_run()
     rows = [row for row in read_rows(run) if row.view != "1/view2.png"]
     record = read_run(run)
     record.aggregates, record.periods = aggregate(rows)
     write_run(run, record, rows)
-    with pytest.raises(ConfigError, match=r"no values of '1/view2\.png': an entry has all"):
+    with pytest.raises(ConfigError, match=r"no values of '1/view2\.png', whose photo has"):
         submit([run], tmp_path / "entries")
 
 
