@@ -351,9 +351,13 @@ def _freedom(column: str, views: frozenset[tuple[str, int, str]]) -> float:
     ``views``: scene, period and name of each.
     """
     counts = Counter((scene, period) for scene, period, _ in views)
-    if column in ("macro", "micro"):
+    if column == "macro":
         periods = Counter(scene for scene, _ in counts)  # that a scene is the mean of
         return pooled_freedom(counts.values(), [1 / periods[scene] for scene, _ in counts])
+    if column == "micro":
+        whole = Counter(scene for scene, _, _ in views)
+        weights = [n / whole[scene] for (scene, _), n in counts.items()]
+        return pooled_freedom(counts.values(), weights)
     # A period, or an aggregate that is mostly one period
     of_one = [n for (_, i), n in counts.items() if column == f"period {i}"] or [*counts.values()]
     return min(map(degrees_of_freedom, of_one), default=math.nan)

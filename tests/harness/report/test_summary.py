@@ -104,6 +104,20 @@ def test_periods_are_resampled_apart_and_seeds_are_averaged():
     assert found["mean"]["median of periods"] == pytest.approx(mean.mean())
 
 
+def test_a_mean_over_views_weighs_periods_by_their_views():
+    few = [VIEWS[0][:3], VIEWS[1]]
+    drawn = [
+        resampled_means({f"{i}/view{k}.png": v for k, v in enumerate(values)}, f"plaza/{i}")
+        for i, values in enumerate(few)
+    ]
+    found = summarise([scored(psnr=few)], ["psnr"]).set_index("column")
+    for column, weights in {"macro": [1, 1], "micro": [3, 9]}.items():
+        means = np.average(drawn, axis=0, weights=weights)
+        expected = interval(means, pooled_freedom([3, 9], weights))
+        assert (found.low[column], found.high[column]) == pytest.approx(expected)
+    assert pooled_freedom([3, 9], [3, 9]) > 1.3 * pooled_freedom([3, 9])
+
+
 def test_other_regions_and_other_periods_are_no_views_of_the_run():
     run = scored(psnr=VIEWS)
     rows = [*run.rows, ViewScore("0/view0.png", 0, 1, "all", "psnr", 0.0)]
