@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from textwrap import indent
 
@@ -12,7 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from chronoscene.cli.options import FOLDER, look_here_for
-from chronoscene.cli.output import emit
+from chronoscene.cli.output import emit, say
+from chronoscene.errors import ConfigError
 from chronoscene.methods import (
     PROGRAM_GROUP,
     MethodSpec,
@@ -47,26 +48,40 @@ def command(name: str | None, runs: Path, everything: bool) -> None:
 
 
 def list_methods() -> None:
-    """Print a table of all installed methods, and one of other programs."""
+    """Print a table of all installed methods, one of other programs, and what is broken."""
     console = Console()
     table = Table(title="Methods")
     for column in ("name", "title", "period input", "presets"):
         table.add_column(column, no_wrap=column == "name")
-    for name in method_names():
-        spec = load_spec(name)
+    methods, broken = _load(method_names())
+    for name, spec in methods.items():
         table.add_row(name, spec.title, spec.period_input, ", ".join(sorted(spec.presets)))
     console.print(table)
-    if programs := method_names(PROGRAM_GROUP):
-        console.print(_program_table(programs))
+    programs, others = _load(method_names(PROGRAM_GROUP))
+    if programs:
+        console.print(_program_table(programs.values()))
     console.print("chronoscene methods NAME describes one: paper, licence, options, costs.")
+    for error in (*broken, *others):
+        say(f"left out: {error}", fg="yellow")
 
 
-def _program_table(names: tuple[str, ...]) -> Table:
+def _load(names: Iterable[str]) -> tuple[dict[str, MethodSpec], list[ConfigError]]:
+    """Load the methods of these names, and collect the errors of those that cannot be."""
+    specs, errors = {}, []
+    for name in names:
+        try:
+            specs[name] = load_spec(name)
+        except ConfigError as error:
+            errors.append(error)
+    return specs, errors
+
+
+def _program_table(specs: Iterable[MethodSpec]) -> Table:
     """Return the table of methods that are other programs."""
     table = Table(title="External programs, installed apart from ChronoScene")
     for column in ("name", "title", "period input", "tested"):
         table.add_column(column, no_wrap=column == "name")
-    for spec in map(load_spec, names):
+    for spec in specs:
         tested = spec.runner.tested if spec.runner else ""
         table.add_row(spec.name, spec.title, spec.period_input, tested)
     return table

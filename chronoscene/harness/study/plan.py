@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from itertools import chain, combinations
@@ -67,7 +68,9 @@ def installed_studies() -> dict[str, Path]:
     """Return the files of all studies of installed methods, by name."""
     found: dict[str, Path] = {}
     for package in dict.fromkeys(entry.module for entry in installed_methods().values()):
-        spec = find_spec(package)
+        spec = None
+        with suppress(Exception):  # whatever the code of others raises
+            spec = find_spec(package)
         for place in (spec.submodule_search_locations if spec else None) or ():
             found |= {file.stem: file for file in sorted(Path(place, FOLDER).glob(f"*{SUFFIX}"))}
     return found

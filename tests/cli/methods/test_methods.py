@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from installed import install
 
 from chronoscene.cli import cli
 from chronoscene.methods import load_spec, method_names, options_of
@@ -21,6 +22,18 @@ def methods(*arguments):
 def test_the_list_has_every_method():
     text = methods()
     assert all(name in text for name in method_names())
+
+
+def test_a_broken_plug_in_is_named_below_the_others(tmp_path, monkeypatch):
+    entries = {"broken": "needs_more:SPEC", "gone": "not.there:SPEC", "no-spec": "needs_none:SPEC"}
+    modules = {"needs_more": "import torch_of_tomorrow", "needs_none": "SPEC = 1"}
+    install(monkeypatch, tmp_path, modules, "chronoscene.methods", entries)
+    done = CliRunner().invoke(cli, ["methods"], catch_exceptions=False)
+    assert done.exit_code == 0 and "chronogs" in done.stdout and "realtime4dgs" in done.stdout
+    lines = done.stderr.splitlines()
+    assert [line.split(":")[1] for line in lines] == [" method broken", " method gone", " no-spec"]
+    assert "No module named 'torch_of_tomorrow'; install what plug-in needs" in lines[0]
+    assert "expected a MethodSpec, found int" in lines[2]
 
 
 @pytest.mark.parametrize("name", [*method_names(), "baselines.external:SPLATFACTO"])

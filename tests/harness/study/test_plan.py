@@ -4,6 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from installed import install
 from training_here import execute_here
 
 from chronoscene.errors import ConfigError
@@ -123,6 +124,13 @@ SHIPPED = {name: read_study(path) for name, path in installed_studies().items()}
 
 
 PUBLISHED = {name for name, study in SHIPPED.items() if study.source}
+
+
+def test_a_broken_plug_in_has_no_studies(tmp_path, monkeypatch):
+    entries = {"broken": "needs_more.method:SPEC", "gone": "not.there:SPEC"}
+    modules = {"needs_more": "import torch_of_tomorrow"}
+    install(monkeypatch, tmp_path, modules, "chronoscene.methods", entries)
+    assert installed_studies().keys() == SHIPPED.keys()
 
 
 def test_studies_of_the_paper_come_with_chronogs():
