@@ -70,5 +70,6 @@ def command(
         return
     made = leakage_table(rows, run.record.period_labels, run.record.label)
     emit(tables.text_of(made, style, width=terminal_width(out)), out)
-    if absent := [title for key, (title, _) in COLUMNS.items() if key not in there]:
+    heads = {key: head.partition(" [")[0] for key, (head, _) in COLUMNS.items()}
+    if absent := [name for key, name in heads.items() if key not in there]:
         click.echo(f"no truth, or nothing rendered, for: {', '.join(absent)}", err=True)

@@ -31,21 +31,21 @@ Key = tuple[str, str]
 """Region and metric."""
 
 COLUMNS: dict[Key, tuple[str, int]] = {
-    (ALL, "psnr"): ("PSNR", 2),
-    (CHANGED, "psnr"): ("PSNR changed", 2),
-    (INVARIANT, "psnr"): ("PSNR invariant", 2),
-    (INVARIANT, "consistency"): ("consistency", 2),
-    (INVARIANT, "consistency_truth"): ("of the truth", 2),
+    (ALL, "psnr"): ("PSNR [dB]", 2),
+    (CHANGED, "psnr"): ("PSNR changed [dB]", 2),
+    (INVARIANT, "psnr"): ("PSNR invariant [dB]", 2),
+    (INVARIANT, "consistency"): ("consistency [dB]", 2),
+    (INVARIANT, "consistency_truth"): ("of the truth [dB]", 2),
     (CHANGED, "sensitivity"): ("sensitivity", 3),
     (CHANGED, "ghosting"): ("ghosting", 3),
     (ALL, "change_ap"): ("AP", 3),
     (ALL, "change_ap_geometry"): ("AP geometry", 3),
     (ALL, "change_ap_appearance"): ("AP appearance", 3),
     (ALL, "depth_abs_rel"): ("AbsRel", 4),
-    (ALL, "depth_rmse"): ("RMSE", 3),
+    (ALL, "depth_rmse"): ("RMSE [world units]", 3),
     (ALL, "depth_delta"): ("delta < 1.25", 3),
 }
-"""Heading and decimals of each measure, in the order of the table."""
+"""Heading with unit, and decimals of each measure, in the order of the table."""
 
 
 def measure_leakage(run: TrainedRun, scene: Scene, truth: Path) -> Iterator[list[ViewScore]]:

@@ -171,7 +171,7 @@ def test_the_table_has_means_over_views_and_pairs():
             for i, v in enumerate(values[pair])]  # fmt: skip
     rows.append(ViewScore("0", 0, 1, "changed", "ghosting", 0.25))
     table = leakage_table(rows, {"0": "may", "1": "june"}, "title")
-    assert [head for head, _ in table.heads] == ["camera of", "rendered", "PSNR", "ghosting"]
+    assert [head for head, _ in table.heads] == ["camera of", "rendered", "PSNR [dB]", "ghosting"]
     assert table.rows == [
         ["may", "may", "25.00", "-"],
         ["may", "june", "10.00", "0.250"],
@@ -224,12 +224,14 @@ def test_the_command_prints_a_table(run, truth, tmp_path):
     result = leakage(run.folder, "--truth", truth, "--format", "markdown", "--out", tmp_path / "x")
     lines = (tmp_path / "x").read_text().splitlines()
     assert lines[0] == "**ring: chronogs joint fast iterations=12 seed 0**"
+    measures = [f"{name} [dB]" for name in ("PSNR", "PSNR changed", "PSNR invariant")]
+    assert [head.strip() for head in lines[2].split("|")[3:6]] == measures
     assert [line.split("|")[1:3] for line in lines[4:]] == [
         *([" spring ", f" {label} "] for label in ("spring", "autumn")),
         *([" autumn ", f" {label} "] for label in ("spring", "autumn")),
         *([" mean ", f" {kind} "] for kind in ("own", "another")),
     ]
-    assert "no truth, or nothing rendered, for: AP appearance, AbsRel, RMSE" in result.stderr
+    assert "no truth, or nothing rendered, for: AP appearance, AbsRel, RMSE, delta" in result.stderr
 
 
 def test_a_scene_without_truth(run):
