@@ -185,11 +185,12 @@ def _check_memory(needs: PhotoNeeds, training: int, free: int | None) -> None:
     least = needs.decoding + _AT_HAND * needs.largest
     if needs.allowed < least:
         width, height = needs.size
+        enough = math.ceil(least / 1e7) / 100
         raise ConfigError(
-            f"{needs.scene}: --photo-memory",
+            f"{needs.scene}: memory for photos",
             expected=f"at least {_gb(least)} to decode photos of {width} x {height} pixels",
             found=_gb(needs.allowed),
-            todo=f"use --photo-memory {math.ceil(least / 1e7) / 100}",
+            todo=f"scale the photos down, or use bench --photo-memory {enough}",
         )
     wanted = needs.in_memory + training
     if free is not None and free < wanted:
@@ -198,7 +199,7 @@ def _check_memory(needs: PhotoNeeds, training: int, free: int | None) -> None:
             needs.scene,
             expected=f"{_gb(wanted)} of memory, {_gb(needs.in_memory)} of it for photos",
             found=f"{_gb(free)} free",
-            todo=f"use --photo-memory {smaller}"
+            todo=f"end other programs, or use bench --photo-memory {smaller}"
             if smaller * 1e9 >= least
             else "end other programs, or use a machine with more memory",
         )
@@ -219,7 +220,7 @@ def _check_disk(runs: Path, needs: PhotoNeeds, images: int) -> None:
             "of test images",
             found=f"{_gb(free)} free",
             todo="choose a place on another disk, or make room there"
-            + (f", or use --photo-disk {smaller}" if needs.on_disk else ""),
+            + (f", or use bench --photo-disk {smaller}" if needs.on_disk else ""),
         )
 
 

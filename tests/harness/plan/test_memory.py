@@ -155,8 +155,8 @@ def test_too_little_memory_for_one_photo_is_refused_with_what_is_enough(make_sce
     free(10**12, 10**12)
     scene = big(make_scene())
     assert refusal(scene, settings) == (
-        "ring: --photo-memory: expected at least 0.51 GB to decode photos of 6000 x 4000 pixels, "
-        "found 0.00 GB; use --photo-memory 0.51"
+        "ring: memory for photos: expected at least 0.51 GB to decode photos of 6000 x 4000 "
+        "pixels, found 0.00 GB; scale the photos down, or use bench --photo-memory 0.51"
     )
     settings.photo_memory = 510_000_000
     room(scene, settings, runs=1)
@@ -170,7 +170,7 @@ def test_more_than_is_free_is_refused_with_a_smaller_setting(make_scene, setting
     free(7_390_000_000, 10**12)
     assert refusal(scene, settings) == (
         "ring: expected 7.40 GB of memory, 0.90 GB of it for photos, found 7.39 GB free; "
-        "use --photo-memory 0.89"
+        "end other programs, or use bench --photo-memory 0.89"
     )
     free(7_330_000_000, 10**12)
     assert refusal(scene, settings).endswith(
@@ -188,7 +188,7 @@ def test_a_full_disk_is_refused_with_a_smaller_setting(make_scene, settings, fre
     message = refusal(scene, settings, runs=2)
     assert "expected room for 0.36 GB of decoded photos and at most 0.11 GB of test" in message
     assert "found 0.46 GB free" in message
-    assert message.endswith("or make room there, or use --photo-disk 0.35")
+    assert message.endswith("or make room there, or use bench --photo-disk 0.35")
     kept = tmp_path / "runs" / "photos"
     kept.mkdir(parents=True)
     (kept / "x.npz").write_bytes(b"")
@@ -201,7 +201,7 @@ def test_bench_says_it_and_refuses_before_anything_is_written(bench, tmp_path, r
     assert any(line.startswith("ring: 5 training photos, 0.00 GB when") for line in said)
     _, said = bench("MEAN", photo_memory=1)  # finished: needs no photos
     assert not any("training photos" in line for line in said)
-    with pytest.raises(ConfigError, match="ring: --photo-memory: expected at least"):
+    with pytest.raises(ConfigError, match="ring: memory for photos: expected at least"):
         bench("MEAN", photo_memory=1, runs=tmp_path / "others")
     assert not (tmp_path / "others").exists()
 
