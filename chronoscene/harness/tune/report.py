@@ -48,7 +48,8 @@ def read_results(study: Study, method: ResolvedMethod) -> list[TrialResult]:
     for trial in study.trials:
         if not trial.state.is_finished():
             continue
-        config = dataclasses.replace(method.config, **draw(trial, method.spec, method.config))
+        # A config of them might be refused.
+        options = dataclasses.asdict(method.config) | draw(trial, method.spec, method.config)
         found = trial.user_attrs
         results.append(
             TrialResult(
@@ -56,7 +57,7 @@ def read_results(study: Study, method: ResolvedMethod) -> list[TrialResult]:
                 psnr=trial.value,
                 seconds=found["seconds"],
                 checkpoint_bytes=found["bytes"],
-                options={name: getattr(config, name) for name in method.spec.search},
+                options={name: options[name] for name in method.spec.search},
                 failure=found["failure"],
                 device=found["device"],
                 commit=found["commit"],

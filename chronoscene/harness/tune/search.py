@@ -23,7 +23,12 @@ from chronoscene.harness.files.source import read_bench_scene
 from chronoscene.harness.plan.finished import first_difference
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.plan import Plan, plan_runs
-from chronoscene.harness.plan.resolve import ResolvedMethod, deciding_options, resolve_method
+from chronoscene.harness.plan.resolve import (
+    ResolvedMethod,
+    deciding_options,
+    resolve_method,
+    resolve_methods,
+)
 from chronoscene.harness.plan.settings import BenchSettings
 from chronoscene.harness.run.local_pool import LocalPool, Pool, open_pool
 from chronoscene.harness.run.progress import RunsDisplay
@@ -42,6 +47,8 @@ JOURNAL = "study.journal"
 TRIALS = "trials"
 SETTINGS = "settings"
 """Attribute of the study."""
+REFUSALS = 20
+"""Trials in a row whose options the method refuses, after which a search ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +101,8 @@ def tune(
 
     Raises:
         ConfigError: If Optuna is missing, the method has no search space, the folder has a search
-            with other settings, or no trial has a result.
+            with other settings, no trial has a result, or the method refuses the options of
+            `REFUSALS` trials in a row.
         ChronoSceneError: As for `run_bench`.
     """
     out = settings.run.runs
@@ -172,6 +180,7 @@ def _run_trials(
     search: _Search, trials: int, missing: int, log: Log, execute: Execute | None
 ) -> None:
     queue = islice(_queue(search, trials), missing)  # more may be left if several ran at a time
+    refusals = 0
     under_way: dict[Future[BenchOutcome], Trial] = {}
     with open_pool(search.settings) as opened:
         pool = opened or LocalPool(1)
@@ -181,6 +190,15 @@ def _run_trials(
                 while True:
                     while len(under_way) < pool.at_once and (trial := next(queue, None)):
                         settings = search.trial_settings(trial)
+                        try:
+                            resolve_methods(settings.methods, settings.run)
+                        except ConfigError as error:
+                            refusals += 1
+                            _finish(search, trial, _refused(search, error), display.log)
+                            if refusals == REFUSALS:
+                                raise _no_options(search, error) from error
+                            continue
+                        refusals = 0
                         plan = plan_runs(settings, _silent)
                         future = threads.submit(_run, plan, settings, pool, display, execute)
                         under_way[future] = trial
@@ -191,6 +209,29 @@ def _run_trials(
             except BaseException:
                 pool.stop.ask()
                 raise
+
+
+def _refused(search: _Search, error: ConfigError) -> BenchOutcome:
+    """Return the outcome of a trial whose options the method refuses."""
+    failure = records.Failure(
+        method=search.method.spec.name,
+        strategy=search.settings.strategies[0],
+        preset=search.settings.run.preset_name,
+        variant="",
+        scene="",
+        seed=search.seed,
+        reason=str(error),
+    )
+    return BenchOutcome(finished=(), skipped=0, failures=(failure,))
+
+
+def _no_options(search: _Search, error: ConfigError) -> ConfigError:
+    return ConfigError(
+        f"tune {search.method.spec.name}",
+        expected="a search space whose options the method takes",
+        found=f"{REFUSALS} refusals in a row; the last one: {error}",
+        todo="narrow the search space in its MethodSpec, and choose another folder with --out",
+    )
 
 
 def _silent(line: str) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from chronoscene.errors import ConfigError
 from chronoscene.methods import MethodSize, MethodSpec, Prediction, Range, StepReport
 
 
@@ -23,6 +24,20 @@ class Config:
     rate: float = 0.5
     sleep: float = 0.0
     ballast: int = 0
+
+
+@dataclass(frozen=True)
+class EvenConfig(Config):
+    def __post_init__(self):
+        if self.ballast % 2:
+            raise ConfigError("ballast", expected="even", found=str(self.ballast), todo="halve it")
+
+
+@dataclass(frozen=True)
+class NoConfig(Config):
+    def __post_init__(self):
+        if self.ballast:
+            raise ConfigError("ballast", expected="none", found="some", todo="leave it out")
 
 
 class MeanColour:
@@ -191,6 +206,10 @@ MEAN = spec("mean", MeanColour)
 TUNED = replace(
     spec("tuned", MeanColour),
     search={"rate": Range(0.001, 1.0), "ballast": Range(0, 9, "int"), "sleep": (0.0, 1e-6)},
+)
+EVEN = replace(TUNED, name="even", config="toy_methods:EvenConfig")
+NONE = replace(
+    TUNED, name="none", config="toy_methods:NoConfig", search={"ballast": Range(0, 9_999, "int")}
 )
 FIXED = spec("fixed", FixedPeriods)
 DRAWING = spec("drawing", Drawing)

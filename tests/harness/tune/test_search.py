@@ -135,6 +135,24 @@ def test_failed_trials_count(search):
         search("none", 2, execute=lambda job: job.failure("too bad"))
 
 
+def test_options_that_the_method_refuses_are_a_failed_trial(search, tmp_path):
+    results = search("out", 8, method="toy_methods:EVEN")
+    assert [result.number for result in results] == [*range(8)]
+    odd = [result for result in results if result.options["ballast"] % 2]
+    assert odd and odd == [result for result in results if result.failure]
+    assert odd[0].failure.startswith("ballast: expected even, found ")
+    rows = list(csv.DictReader((tmp_path / "out/trials.csv").open()))
+    assert [row["failure"] for row in rows] == [result.failure for result in results]
+    assert search("out", 8, method="toy_methods:EVEN") == results
+
+
+def test_a_search_ends_where_the_method_refuses_everything(search, tmp_path):
+    for trials in (22, 42):
+        with pytest.raises(ConfigError, match=r"found 20 refusals in a row; .* expected none"):
+            search("out", 99, method="toy_methods:NONE")
+        assert len((tmp_path / "out/trials.csv").read_text().splitlines()) == trials
+
+
 def test_views_that_masks_ignore_have_no_score(search, scene_folder, tmp_path):
     masked = Path(shutil.copytree(scene_folder, tmp_path / "masked"))
     for name in ("a/0.png", "b/3.png"):  # the validation views
