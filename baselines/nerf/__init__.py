@@ -53,7 +53,7 @@ NERF = MethodSpec(
     period_input="none",
     method="baselines.nerf.method:Nerf",
     presets=_presets({}),
-    **_COMMON,
+    **_COMMON | {"config": "baselines.nerf.config:TimelessConfig"},
 )
 NERF_T = MethodSpec(
     name="nerf-t",
@@ -74,7 +74,7 @@ NERF_W = MethodSpec(
     period_input="none",
     method="baselines.nerf.method:NerfW",
     presets=_presets({"appearance": "image", "transient": "density"}),
-    **_COMMON,
+    **_COMMON | {"config": "baselines.nerf.config:TimelessConfig"},
 )
 # Where the content changes with the time, the weight of the paper lets the transient head take all.
 _W_T: dict[str, Any] = {

@@ -16,7 +16,7 @@ class NerfConfig(FieldConfig):
 
     opacity_weight: NonNegativeFloat = 0.0
     """Weight of the entropy -o log o of the rays' opacities o in the loss; with a `transient` it
-    has no effect."""
+    has no effect, and cannot be set."""
     time: Literal["none", "frequencies", "steps"] = "none"
     """Dependence of colours on the time t = period / (T - 1): not; by sines and cosines of it
     (NeRF-T); by learned step functions, so that content switches (NeuSC)."""
@@ -45,15 +45,27 @@ class NerfConfig(FieldConfig):
     transient_weight: NonNegativeFloat = 0.01
     """Weight of the mean transient density."""
 
+    def without_effect(self) -> dict[str, str]:
+        """Return options that do nothing beside the others, and what they need."""
+        return {} if self.transient == "none" else {"opacity_weight": "transient=none"}
+
 
 @dataclass(frozen=True)
 class PlainConfig(NerfConfig):
-    """Options of NeRF and NeRF-W."""
+    """Options of NeRF-T and NeRF-W-T."""
 
     time: Literal["none", "frequencies"] = "none"
     """Dependence of colours on the time t = period / (T - 1): not; by sines and cosines of it."""
     appearance: Literal["none", "image"] = "none"
     """Code of a photo's light: none, or a learned one for each photo."""
+
+
+@dataclass(frozen=True)
+class TimelessConfig(PlainConfig):
+    """Options of NeRF and NeRF-W."""
+
+    time: Literal["none"] = "none"
+    """Colours do not depend on the time, which the method does not know."""
 
 
 @dataclass(frozen=True)

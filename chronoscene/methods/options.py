@@ -54,17 +54,28 @@ def build_config(
         overrides: Values that replace those of the preset.
 
     Raises:
-        ConfigError: If the preset or a key is unknown, or a value is not what the option takes.
+        ConfigError: If the preset or a key is unknown, a value is not what the option takes, or an
+            option that is given has no effect beside the others.
     """
     config_class = import_object(spec.config)
     start = find_preset(preset, spec)
     check_choice(f"{spec.name} --preset", start.base, spec.presets)
     adapters, values = _adapters(config_class), dict(spec.presets[start.base])
-    for place, given in ((preset, start.options), (f"{spec.name} --set", overrides or {})):
+    places = ((preset, start.options), (f"{spec.name} --set", overrides or {}))
+    for place, given in places:
         for key, value in given.items():
             check_choice(place, key, adapters)
             values[key] = _parsed(f"{place} {key}", value, adapters[key])
     config: MethodConfig = config_class(**values)
+    idle = config.without_effect() if hasattr(config, "without_effect") else {}
+    for place, given in places:
+        for key in given.keys() & idle.keys():
+            raise ConfigError(
+                f"{place} {key}",
+                expected=f"{idle[key]}, without which it has no effect",
+                found="another value",
+                todo="leave one of them out",
+            )
     return config
 
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from baselines.nerf.time import step_code
+from chronoscene.errors import ConfigError
 from chronoscene.fields.method import FieldMethod
 from chronoscene.harness.train.painted_balls import make_training_set
 from chronoscene.methods import build_config, import_object, load_spec
@@ -60,6 +61,23 @@ def test_flags_go_together(name: str, values: tuple[str, ...], tmp_path: Path) -
     loaded.load(tmp_path, device="cpu")
     images = [m.render(data.views[0], 1.0).rgb for m in (method, loaded)]
     assert np.array_equal(*images)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("nerf-w", {"opacity_weight": 0.01}, "nerf-w --set opacity_weight: .* transient=none"),
+        ("neusc", {"opacity_weight": 0.01}, "neusc --set opacity_weight: .* transient=none"),
+        ("nerf", {"opacity_weight": 0.01, "transient": "mask"}, "nerf --set opacity_weight: "),
+        ("nerf", {"time": "frequencies"}, "nerf --set time: expected 'none', found 'frequ"),
+        ("nerf-w", {"time": "frequencies"}, "nerf-w --set time: expected 'none', found 'frequ"),
+    ],
+)
+def test_options_without_effect_are_refused(name: str, given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build_config(load_spec(name), preset="fast", overrides=given)
+    spec = load_spec("nerf")
+    assert build_config(spec, preset="fast", overrides={"opacity_weight": 0.01}) is not None
 
 
 def test_steps_are_hard_and_have_a_slope() -> None:

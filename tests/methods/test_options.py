@@ -52,6 +52,27 @@ def test_overrides_are_parsed_like_the_default():
     assert isinstance(config.rate, float)
 
 
+@dataclass(frozen=True)
+class Idle(Config):
+    def without_effect(self):
+        return {} if self.flag else {"limit": "flag=true"}
+
+
+def test_an_option_without_effect_is_refused_where_it_is_given(tmp_path):
+    spec = replace(SPEC, config=f"{__name__}:Idle", presets={"fast": {"limit": 7}})
+    assert build_config(spec, preset="fast").limit == 7
+    assert build_config(spec, preset="fast", overrides={"limit": 3, "flag": True}).limit == 3
+    file = tmp_path / "own.toml"
+    file.write_text('method = "toy"\nbase = "fast"\n[options]\nlimit = 3\n')
+    for given, place in (
+        ({"preset": "fast", "overrides": {"limit": "3"}}, "toy --set limit"),
+        ({"preset": str(file)}, f"{file} limit"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            build_config(spec, **given)
+        assert str(caught.value).startswith(f"{place}: expected flag=true, without which it has no")
+
+
 @pytest.mark.parametrize("value", ["[3, 4]", "(3, 4)", "(3,4,)", "[3,4]"])
 def test_tuples_are_written_as_in_python_or_json(value):
     assert build_config(SPEC, preset="fast", overrides={"sizes": value}).sizes == (3, 4)
