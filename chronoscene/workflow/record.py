@@ -13,7 +13,7 @@ from chronoscene.harness.files.records import read_document
 from chronoscene.images.masks import MASKS
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import counted
-from chronoscene.registration.photos.captures import photos_in
+from chronoscene.registration.photos.captures import photos_in, photos_of
 
 RECORD_FILE = "steps.json"
 
@@ -65,7 +65,7 @@ def read_record(out: Path) -> Record | None:
 def new_record(folder: Path, table: Path | None, options: Options) -> Record:
     """Make a record of what there is, without steps."""
     masks = folder.absolute().parent / MASKS
-    files = [*photos_in(folder), *photos_in(masks), *([] if table is None else [table])]
+    files = [*photos_of(folder, table), *photos_in(masks), *([] if table is None else [table])]
     status = {os.path.relpath(path, folder): path.stat() for path in files}
     photos = {name: (found.st_size, found.st_mtime_ns) for name, found in status.items()}
     return Record(photos=photos, options=dict(options))

@@ -17,7 +17,7 @@ from chronoscene.io.staging import (
 )
 from chronoscene.io.wording import format_time
 from chronoscene.methods import build_config, is_preset_file, load_spec
-from chronoscene.registration.photos.captures import find_captures
+from chronoscene.registration.photos.captures import find_captures, photo_folders
 from chronoscene.registration.work_folder import fingerprint
 from chronoscene.workflow.record import (
     RECORD_FILE,
@@ -48,8 +48,7 @@ def start(captures: Path, table: Path | None, out: Path, options: Options) -> tu
     build_config(load_spec(METHOD), preset=str(options["preset"]))
     if options["budget"] is not None:
         parse_duration(str(options["budget"]))
-    folder, table = find_captures(captures, table)
-    check_outside(out, [folder], option="OUT")
+    check_outside(out, photo_folders(captures, table), option="OUT")
     check_not_current(out)
     before = read_record(out)
     if before is None and out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -59,7 +58,7 @@ def start(captures: Path, table: Path | None, out: Path, options: Options) -> tu
             found="one in use" if out.is_dir() else "a file",
             todo="choose another folder",
         )
-    record = new_record(folder, table, options)
+    record = new_record(*find_captures(captures, table), options)
     changes = describe_changes(before or record, record)
     made_anew: list[str] = []
     for step in STEPS:

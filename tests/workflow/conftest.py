@@ -36,6 +36,11 @@ class Fake:
         return self.root / "photos"
 
     @property
+    def captures(self):
+        table = self.root / "dates.csv"
+        return table if table.exists() else self.photos
+
+    @property
     def out(self):
         return self.root / "out"
 
@@ -54,10 +59,10 @@ class Fake:
     def go(self, **options):
         """Run the steps; returns what was printed."""
         given = {"preset": "fast", "budget": None, "max_width": 500} | options
-        record, changes = start(self.photos, None, self.out, given)
+        record, changes = start(self.captures, None, self.out, given)
         self.calls.clear()
         said = [changes]
-        run_steps(Project(self.photos, None, self.out, given, record, said.append, progress_bar))
+        run_steps(Project(self.captures, None, self.out, given, record, said.append, progress_bar))
         return said
 
     def make(self, step, project):

@@ -7,6 +7,7 @@ import pytest
 
 from chronoscene.errors import ChronoSceneError, ConfigError, RegistrationError, SceneError
 from chronoscene.workflow import steps
+from chronoscene.workflow.run import start
 from chronoscene.workflow.steps import STEPS
 
 NAMES = [step.name for step in STEPS]
@@ -65,6 +66,18 @@ def test_another_option_renews_what_follows_from_it(fake):
     )
     assert fake.calls == ["bench", "page", "export", "survey"]
     assert "--budget 5m" in fake.html
+
+
+def test_what_lies_beside_a_table_is_no_photo(fake):
+    rows = "photos/2016/1.jpg,2016\nphotos/2023/1.jpg,2023\n"
+    (fake.root / "dates.csv").write_text(f"image,period\n{rows}")
+    fake.go()
+    assert {*fake.recorded["photos"]} == {"dates.csv", "photos/2016/1.jpg", "photos/2023/1.jpg"}
+    assert fake.go()[0] == "" and fake.calls == ["survey"]
+    (fake.photos / "2023/1.jpg").write_text("another")
+    assert fake.go()[0].startswith("changed: 1 file changed; made anew: ")
+    with pytest.raises(ConfigError, match="expected a place outside the scene"):
+        start(fake.captures, None, fake.photos / "out", {"preset": "fast", "budget": None})
 
 
 def test_other_photos_renew_everything_that_changes(fake):

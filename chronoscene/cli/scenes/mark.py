@@ -12,7 +12,7 @@ from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.geodesy import read_reference_system
 from chronoscene.io.staging import check_outside, write_text_atomic
-from chronoscene.registration.photos.captures import find_captures, read_captures
+from chronoscene.registration.photos.captures import photo_folders, read_captures
 from chronoscene.registration.report.marking import marking_page
 from chronoscene.registration.ties.tie_points import read_tie_points
 
@@ -62,8 +62,7 @@ def command(
     browser, mark points, and save points.csv, which register reads by --tie-points. Coordinates are
     in pixels of the original photos.
     """
-    folder, table = find_captures(captures, table)
-    check_outside(page, [folder], option="PAGE")
+    check_outside(page, photo_folders(captures, table), option="PAGE")
     check_file("PAGE", page)
     system = None if crs is None else read_reference_system("--crs", crs, error=ConfigError)
     points = None
@@ -72,7 +71,7 @@ def command(
     else:
         points = read_tie_points(tie_points, scale=tie_scale, crs=system)
     with progress_bar(f"read {captures}") as report:
-        found = read_captures(folder, table=table).images
+        found = read_captures(captures, table=table).images
         text = marking_page(
             found, points=points, model=model, max_size=max_size, title=page.stem, report=report
         )

@@ -15,7 +15,7 @@ from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
 from chronoscene.registration.features.camera_groups import AUTO, FEW, MANY, MIN_PHOTOS
 from chronoscene.registration.output import Inspection
-from chronoscene.registration.photos.captures import find_captures, read_captures
+from chronoscene.registration.photos.captures import photo_folders, read_captures
 from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import ROUTES, Registered
 
@@ -151,16 +151,16 @@ def command(
     position. Exit status: 0 if both are pass, doubtful or not checked, 1 if either is fail (the
     scene is written nevertheless), 2 if the photos cannot be registered or the usage is wrong.
     """
-    folder, table = find_captures(captures, table)
+    kept = [*photo_folders(captures, table), *([] if scene is None else [scene])]
     options = Options(**settings)
     _check_together(options, scene)
     for option, place in (("OUT", out), ("--work", options.work or options.work_folder(out))):
-        check_outside(place, [folder, *([] if scene is None else [scene])], option=option)
+        check_outside(place, kept, option=option)
         check_place(option, place)
     inspections: list[Inspection] = []
     try:
         with progress_bar(f"read {captures}") as report:
-            found = read_captures(folder, table=table)
+            found = read_captures(captures, table=table)
             registered = run(
                 found,
                 out,

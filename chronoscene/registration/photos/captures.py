@@ -82,6 +82,30 @@ def find_captures(path: Path, table: Path | None) -> tuple[Path, Path | None]:
     raise _nothing(path, "another file" if path.exists() else "nothing there", "check the path")
 
 
+def photos_of(folder: Path, table: Path | None) -> list[Path]:
+    """List the photos of a folder, or those of a table that are there, sorted.
+
+    Raises:
+        SceneError: If the table is wrong.
+    """
+    if table is None:
+        return photos_in(folder)
+    return sorted(item.path for item in _from_table(folder, table) if item.path.is_file())
+
+
+def photo_folders(path: Path, table: Path | None) -> list[Path]:
+    """Return the folders of the user into which nothing may be written.
+
+    For a table in place of a folder, these are the folders of its photos, not all that lies beside
+    it. Arguments and errors as in `read_captures`.
+    """
+    folder, found = find_captures(path, table)
+    if path.is_dir():
+        return [folder]
+    tops = (photo.relative_to(folder).parts[:-1][:1] for photo in photos_of(folder, found))
+    return [folder.joinpath(*top) for top in dict.fromkeys(tops)]
+
+
 def read_captures(path: Path, *, table: Path | None = None) -> Captures:
     """Find the photographs of all periods.
 

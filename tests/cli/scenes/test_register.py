@@ -63,6 +63,32 @@ def test_too_few_photos_end_in_one_message(tmp_path: Path, count: int) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_the_scene_may_lie_beside_a_table_but_not_in_its_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The photos, three folders deep, are those of the table, whatever else lies beside it."""
+    monkeypatch.chdir(tmp_path)
+    photos(Path("site/2016/a"), 2)
+    photos(Path("disk/b"), 2)
+    Path("new").symlink_to("disk")
+    Path("dates.csv").write_text("image,period\nsite/2016/a/0.jpg,2016\nnew/b/1.jpg,2023\n")
+    for place in ("site/out", "site/2016/a/out", "new/out", "disk/out"):
+        assert isinstance(call("dates.csv", place).exception, ConfigError), place
+        assert isinstance(call("dates.csv", "out", "--work", place).exception, ConfigError)
+    seen: list[Any] = []
+
+    def run(captures: Any, *inputs: Any, **options: Any) -> None:
+        seen.extend(image.name for image in captures.images)
+        raise RegistrationError("photos", expected="overlap", found="none", todo="add photos")
+
+    monkeypatch.setattr(register, "run", run)
+    assert isinstance(call("dates.csv", "out").exception, RegistrationError)
+    assert seen == ["new/b/1.jpg", "site/2016/a/0.jpg"]
+    Path("dates.csv").write_text("image,period\n0.jpg,2016\n")
+    photos(Path("flat"), 1).joinpath("0.jpg").rename("0.jpg")
+    assert isinstance(call("dates.csv", "out").exception, ConfigError)
+
+
 @pytest.mark.parametrize(
     "places",
     [["in/out"], ["out", "--work", "in/work"], ["out", "--into", "old", "--work", "old/work"]],
