@@ -33,6 +33,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
+LOCK = "lock"
 VERSION = 2  # Version of what stages store; other versions are not read
 PATIENCE = 5.0  # Seconds; a task ends within one second after its command was killed
 
@@ -115,7 +116,8 @@ def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
         those of a killed command end before the next command begins.
 
     Raises:
-        RegistrationError: If another process works in it, or the system has no locks of this kind.
+        RegistrationError: If something else is in it, another process works in it, or the system
+            has no locks of this kind.
     """
     if fcntl is None:
         raise RegistrationError(
@@ -125,7 +127,14 @@ def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
             todo="run it in the Windows Subsystem for Linux (WSL)",
         )
     path.mkdir(parents=True, exist_ok=True)
-    with (path / "lock").open("w") as lock:
+    if any(path.iterdir()) and not (path / LOCK).is_file():  # photos/ in it would be emptied
+        raise RegistrationError(
+            path,
+            expected="a new or empty work folder, or that of an earlier run",
+            found="other files",
+            todo="choose another folder",
+        )
+    with (path / LOCK).open("w") as lock:
         end = time.monotonic() + patience
         while not _locked(lock.fileno()):
             if time.monotonic() > end:

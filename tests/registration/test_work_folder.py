@@ -74,6 +74,18 @@ def test_two_runs_do_not_share_a_work_folder(tmp_path: Path) -> None:
         pass
 
 
+def test_a_folder_with_other_files_is_no_work_folder(tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    (mine / "photos").mkdir(parents=True)
+    with pytest.raises(RegistrationError, match="new or empty work folder"), work_folder(mine):
+        pass
+    assert [path.name for path in mine.iterdir()] == ["photos"]
+    with work_folder(tmp_path / "new"):
+        (tmp_path / "new/photos").mkdir()
+    with work_folder(tmp_path / "new"):
+        pass
+
+
 def test_a_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("chronoscene.registration.work_folder.fcntl", None)
     message = "register: expected Linux or macOS, .* found .*; run it in the Windows Subsystem"

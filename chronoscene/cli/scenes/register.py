@@ -10,6 +10,7 @@ import click
 from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, refuse_options
 from chronoscene.cli.output import check_place, emit, say
 from chronoscene.cli.progress import progress_bar
+from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
@@ -156,6 +157,7 @@ def command(
     _check_together(options, scene)
     for option, place in (("OUT", out), ("--work", options.work or options.work_folder(out))):
         check_outside(place, kept, option=option)
+        _check_not_around(place, kept, option)
         check_place(option, place)
     inspections: list[Inspection] = []
     try:
@@ -177,6 +179,22 @@ def command(
     emit(text + "".join(f"note: {note}\n" for note in found.notes), None)
     if any(i.failed for i in inspections):
         context.exit(FAILED)
+
+
+def _check_not_around(place: Path, folders: list[Path], option: str) -> None:
+    """Refuse a folder that has photos in it, as what it holds is replaced.
+
+    Raises:
+        ConfigError: If it has.
+    """
+    for folder in folders:
+        if folder.resolve().is_relative_to(place.resolve()):
+            raise ConfigError(
+                f"{option} {place}",
+                expected="a folder of its own",
+                found=f"{folder} in it",
+                todo="choose another folder: what it holds is replaced",
+            )
 
 
 def _check_together(options: Options, scene: Path | None) -> None:

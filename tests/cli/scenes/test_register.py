@@ -91,7 +91,14 @@ def test_the_scene_may_lie_beside_a_table_but_not_in_its_photos(
 
 @pytest.mark.parametrize(
     "places",
-    [["in/out"], ["out", "--work", "in/work"], ["out", "--into", "old", "--work", "old/work"]],
+    [
+        ["in/out"],
+        ["out", "--work", "in/work"],
+        ["out", "--into", "old", "--work", "old/work"],
+        ["out", "--work", "."],
+        ["../" * 9, "--overwrite"],
+        ["out", "--into", "old", "--work", "a/.."],
+    ],
 )
 def test_nothing_goes_into_the_photos_or_the_scene(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, places: list[str]

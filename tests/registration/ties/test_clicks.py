@@ -144,6 +144,7 @@ def tied(case: Any, clicks: Path) -> tuple[Registered, TieAlignment]:
         case.folder / "held_out.npz",
         names=np.frombuffer(b"{}", np.uint8), track=nothing, image=nothing, xy=np.zeros((0, 2)),
     )  # fmt: skip
+    (case.folder / "lock").touch()
     with work_folder(case.folder) as lock:
         options = Options(threads=1, tie_points=clicks)
         context = Context(case.folder, Stages(case.folder), options, None, lock)
