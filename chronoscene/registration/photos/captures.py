@@ -178,6 +178,12 @@ def _period_folders(root: Path, photos: Sequence[Path]) -> tuple[list[_Listed], 
     return listed, _left_out(beside, "lie beside the folders of the periods")
 
 
+def _only_folder(root: Path, photos: Sequence[Path]) -> str | None:
+    """Return the name of the subfolder that has all photos; None if there is none."""
+    tops = {p.relative_to(root).parts[0] for p in photos}
+    return tops.pop() if len(tops) == 1 and photos[0].parent != root else None
+
+
 def _left_out(photos: Sequence[Path], why: str) -> list[str]:
     """Name photos without a period; nothing if there are none."""
     if not photos:
@@ -237,7 +243,8 @@ def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str], 
         groups[-1].append(item)
     if len(groups) < 2 and undated:
         remark = f"{len(undated)} of {len(photos)} photos have no date: all are one period"
-        return [_Listed(p, p.relative_to(root).as_posix(), root.name) for p in photos], [remark], []
+        label = _only_folder(root, photos) or root.name
+        return [_Listed(p, p.relative_to(root).as_posix(), label) for p in photos], [remark], []
     listed = []
     for group in groups:
         label = group[0][0].date().isoformat()

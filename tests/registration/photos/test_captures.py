@@ -94,6 +94,19 @@ def test_undated_photos_of_one_visit_are_of_that_period(tmp_path: Path) -> None:
     assert len(found.periods) == 1 and len(found.images) == 2 and not found.notes
 
 
+@pytest.mark.parametrize(
+    ("names", "label"),
+    [(("2016/a.jpg", "2016/east/b.jpg"), "2016"), (("a.jpg", "2016/b.jpg"), "old"),
+     (("a.jpg",), "old")],
+)  # fmt: skip
+def test_undated_photos_are_of_the_period_that_their_folder_names(
+    tmp_path: Path, names: tuple[str, ...], label: str
+) -> None:
+    for name in names:
+        photo(tmp_path / "old" / name)
+    assert [period.label for period in read_captures(tmp_path / "old").periods] == [label]
+
+
 def test_a_stray_photo_does_not_hide_the_folders_of_the_periods(tmp_path: Path) -> None:
     for name in ("2016/a.jpg", "2023/b.jpg", "map.png"):
         photo(tmp_path / name)
