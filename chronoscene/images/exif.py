@@ -76,6 +76,8 @@ class ExifData:
     """Degrees, east positive (WGS 84)."""
     altitude: float | None = None
     """Metres, negative below the reference: the sea or the ellipsoid, which the maker decides."""
+    no_hemisphere: bool = False
+    """True if a position is left out as it names no hemisphere: Exif has no default for it."""
     focal_mm: float | None = None
     focal_35mm: float | None = None
     """Focal length on 36 x 24 mm film with the same view, in millimetres."""
@@ -145,10 +147,17 @@ def _ifd(tags: Image.Exif, key: int) -> Mapping[int, Any]:
 def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
     main: Mapping[int, Any] = dict(tags)
     exif, gps = _ifd(tags, ExifTags.IFD.Exif), _ifd(tags, ExifTags.IFD.GPSInfo)
-    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "S", 90.0)
-    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "W", 180.0)
+    latitude = _degrees(gps.get(GPS.GPSLatitude), 90.0)
+    longitude = _degrees(gps.get(GPS.GPSLongitude), 180.0)
+    north = _sign(gps.get(GPS.GPSLatitudeRef), "NS")
+    east = _sign(gps.get(GPS.GPSLongitudeRef), "EW")
+    no_hemisphere = False
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         latitude = longitude = None  # without a fix, some cameras write zeros
+    elif north is None or east is None:
+        latitude, longitude, no_hemisphere = None, None, True
+    else:
+        latitude, longitude = north * latitude, east * longitude
     altitude = _number(gps.get(GPS.GPSAltitude))
     if altitude is not None and _integer(gps.get(GPS.GPSAltitudeRef)) in (1, 3):
         altitude = -altitude  # below the reference
@@ -159,6 +168,7 @@ def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
         latitude=latitude,
         longitude=longitude,
         altitude=altitude,
+        no_hemisphere=no_hemisphere,
         focal_mm=_positive(_number(exif.get(Base.FocalLength))),
         focal_35mm=_positive(_number(exif.get(Base.FocalLengthIn35mmFilm))),
         focal_plane=_focal_plane(exif),
@@ -245,8 +255,8 @@ def _gps_date(gps: Mapping[int, Any]) -> datetime | None:
     return date + timedelta(hours=hour, minutes=minute % 60, seconds=second % 60)
 
 
-def _degrees(value: Any, ref: Any, negative: str, limit: float) -> float | None:
-    """Combine degrees, minutes and seconds in one signed number."""
+def _degrees(value: Any, limit: float) -> float | None:
+    """Combine degrees, minutes and seconds in one number without a sign."""
     if not isinstance(value, tuple | list) or not 1 <= len(value) <= 3:
         return None
     degrees = 0.0
@@ -254,9 +264,13 @@ def _degrees(value: Any, ref: Any, negative: str, limit: float) -> float | None:
         if part is None or part < 0:
             return None
         degrees += part / 60**i
-    if degrees > limit:
-        return None
-    return -degrees if (_text(ref) or "").upper().startswith(negative) else degrees
+    return degrees if degrees <= limit else None
+
+
+def _sign(ref: Any, directions: str) -> int | None:
+    """Return 1 for the first of two directions and -1 for the second; None for anything else."""
+    found = directions.find((_text(ref) or " ")[0].upper())
+    return None if found < 0 else 1 - 2 * found
 
 
 def _number(value: Any) -> float | None:

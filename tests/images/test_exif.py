@@ -135,7 +135,23 @@ def test_date_of_digitisation_where_there_is_no_other():
     ],
 )
 def test_positions_that_are_none(gps):
-    assert not read(photo(gps=gps)).has_position
+    data = read(photo(gps=gps))
+    assert not data.has_position and not data.no_hemisphere
+
+
+@pytest.mark.parametrize(
+    "references", [{}, {1: "S"}, {3: "W"}, {1: "", 3: "W"}, {1: "S", 3: "?"}, {1: "E", 3: "N"}]
+)
+def test_positions_without_a_hemisphere_are_none(references):
+    data = read(photo(gps={2: (33, 51, 24.12), 4: (70, 30, 0.0)} | references))
+    assert not data.has_position and data.no_hemisphere
+
+
+@pytest.mark.parametrize(("north", "east"), [("n", "west"), ("North", "W\0")])
+def test_hemispheres_in_other_spellings(north, east):
+    data = read(photo(gps=FULL["gps"] | {1: north, 3: east}))
+    assert (data.latitude, data.longitude) == (pytest.approx(33.85670), pytest.approx(-70.5))
+    assert not data.no_hemisphere
 
 
 def test_pixels_are_not_decoded(tmp_path):

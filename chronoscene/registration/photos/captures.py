@@ -55,13 +55,15 @@ class Captures:
     """Periods with photos that were taken at another time by their metadata, in words."""
     left_out: tuple[str, ...] = ()
     """Photos of which no period is known, in words."""
+    unplaced: tuple[str, ...] = ()
+    """Photos whose GPS position names no hemisphere, in words."""
     undisputed: frozenset[Path] = frozenset()
     """Files of the photos whose own dates may date their period."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Everything to be said about periods, for the end of a command."""
-        return (*self.left_out, *self.misdated)
+        """Everything to be said about periods and positions, for the end of a command."""
+        return (*self.left_out, *self.misdated, *self.unplaced)
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +306,8 @@ def _assemble(
         for label, mine, others in zip(order, dated, wrong, strict=True)
         if others
     )
-    remarks = (*(proposed or ()), f"periods: {shown}", *left_out, *misdated)
+    unplaced = _unplaced(images)
+    remarks = (*(proposed or ()), f"periods: {shown}", *left_out, *misdated, *unplaced)
     disputed = {name for others in wrong for name, _ in others}
     return Captures(
         root,
@@ -314,7 +317,20 @@ def _assemble(
         remarks,
         misdated,
         left_out=tuple(left_out),
+        unplaced=unplaced,
         undisputed=frozenset(c.path for c in images if c.name not in disputed),
+    )
+
+
+def _unplaced(images: Sequence[Capture]) -> tuple[str, ...]:
+    """Name photos whose GPS position is not used; nothing if there are none."""
+    found = [c.name for c in images if c.exif.no_hemisphere]
+    if not found:
+        return ()
+    return (
+        f"{len(found)} of {len(images)} photos, such as {found[0]}, have a GPS position without "
+        "N or S, or without E or W; it is not used; write what is missing with exiftool "
+        "(GPSLatitudeRef, GPSLongitudeRef)",
     )
 
 

@@ -120,6 +120,18 @@ def exif_position(scene: RawScene, images: RawImages) -> Iterator[Hit]:
             yield Hit(place, "a camera at its GPS position", f"a camera {metres:.3g} m away")
 
 
+@rule.warning(
+    "CS229",
+    bad="a latitude of 48 degrees without `GPSLatitudeRef`, which is N or S",
+    remedy="write the references: exiftool -GPSLatitudeRef=N -GPSLongitudeRef=E IMAGE, or S and W",
+)
+def exif_no_hemisphere(scene: RawScene) -> Iterator[Hit]:
+    """The GPS position of a photo has no N or S, or no E or W, so it is not used."""
+    for name, header in scene.headers.items():
+        if header.exif.no_hemisphere:
+            yield Hit(f"images/{name}", "a latitude with N or S, a longitude with E or W", "none")
+
+
 def _mostly_far(scene: RawScene, fit: GpsFit, far: np.ndarray) -> dict[int, Hit]:
     """One hit for each period of which most photos are far away, by the index of the period."""
     hits = {}

@@ -128,6 +128,20 @@ def tag_places_of(scene, names, moved):
         image.save(scene.path(f"images/{name}"), exif=Image.Exif())
 
 
+def test_a_position_without_a_hemisphere(scene):
+    tag_places(scene)
+    path = scene.path("images/a002.png")
+    with Image.open(path) as image:
+        image.load()
+        exif = image.getexif()
+    gps = dict(exif.get_ifd(0x8825))
+    for missing in (1, 3):
+        exif.get_ifd(0x8825).clear()
+        exif.get_ifd(0x8825).update({tag: gps[tag] for tag in gps if tag != missing})
+        image.save(path, exif=exif)
+        scene.expect("CS229", place="images/a002.png", found="none")
+
+
 def test_positions_that_do_not_fit_at_all(scene):
     rng = np.random.default_rng(3)
     for name in NAMES:
