@@ -95,7 +95,8 @@ def readable(cloud: Cloud, box: Box) -> tuple[Cloud, Box, tuple[str, ...]]:
     box = Box((box.low - offset) / factor, (box.high - offset) / factor)
     units = {-3: " [mm]", 0: " [m]", 3: " [km]"}
     unit = units[power] if cloud.unit == "metre" else f" [$10^{{{power}}}$]" if power else ""
-    taken = [f" {'-' if x > 0 else '+'} {abs(x):,.12g}" if x else "" for x in offset]
+    # In the unit of the axis, like its numbers.
+    taken = [f" {'-' if x > 0 else '+'} {abs(x):,.12g}" if x else "" for x in offset / factor]
     names = tuple(f"{axis}{shift}{unit}" for axis, shift in zip(AXES, taken, strict=True))
     return replace(cloud, xyz=xyz, centres=centres), box, names
 

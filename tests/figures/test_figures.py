@@ -228,6 +228,8 @@ def test_the_colours_of_all_periods_are_in_the_picture(cloud, tmp_path):
         (1e-3, (0, 0, 0), "metre", ("x [mm]", "y [mm]", "z [mm]")),
         (1e-3, (0, 0, 0), "unknown", tuple(f"{a} [$10^{{-3}}$]" for a in "xyz")),
         (5e3, (0, 0, 0), "metre", ("x [km]", "y [km]", "z [km]")),
+        (5e3, (2e7, -3e7, 0), "metre", ("x - 20,000 [km]", "y + 30,000 [km]", "z [km]")),
+        (1e-3, (5, 0, 0), "metre", ("x - 5,000 [mm]", "y [mm]", "z [mm]")),
         (1e6, (0, 0, 0), "unknown", tuple(f"{a} [$10^{{6}}$]" for a in "xyz")),
     ],
 )
