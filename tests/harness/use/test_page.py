@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from chronoscene.harness.use import page_gaussians
 from chronoscene.harness.use.page import EXTENT
 from chronoscene.harness.use.page_gaussians import Reduction, fit_gaussians, pack, unite
 from chronoscene.harness.use.trained_run import open_run
+from chronoscene.io.pages import TEMPLATES
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.similarity import Sim3
@@ -154,6 +156,54 @@ def test_no_space_leaves_nothing_behind(trained, tmp_path, monkeypatch):
     with pytest.raises(DiskFullError, match="page: expected space"):
         make_page([trained["chronogs"]], tmp_path / "page")
     assert not list(tmp_path.iterdir())
+
+
+KEYS = """
+const heard = {}, page = { addEventListener: (name, act) => { heard[name] = act; } };
+globalThis.document = page;
+globalThis.addEventListener = () => {};
+let waiting = [], moves = 0;
+globalThis.requestAnimationFrame = act => waiting.push(act);
+listenToKeys({ move: () => { moves += 1; }, key: () => false });
+const target = { closest: () => null }, preventDefault = () => {};
+const press = (key, code) => heard.keydown({ key, code, target, preventDefault });
+const letGo = (key, code) => heard.keyup({ key, code });
+const frame = () => waiting.splice(0).forEach(act => act());
+press("Shift", "ShiftLeft"); press("+", "Equal");
+frame(); frame();
+letGo("Shift", "ShiftLeft"); letGo("=", "Equal");
+frame(); frame();
+console.log(moves);
+"""
+
+
+def in_node(*scripts, then):
+    """What some scripts of the page print with a few lines more, without a browser."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no node here")
+    texts = [
+        (TEMPLATES / "run_page" / f"{name}.js").read_text(encoding="utf-8") for name in scripts
+    ]
+    text = "\n".join([*texts, then])
+    done = subprocess.run([node, "-e", text], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_key_ends_its_flight_though_shift_was_let_go_before_it():
+    assert in_node("vectors", "view", "controls", then=KEYS) == "2\n"
+
+
+def test_a_link_to_half_a_run_is_refused():
+    scene = {"periods": ["a", "b"], "runs": [{}, {}], "frames": []}
+    then = f"""
+        const problems = [], scene = {json.dumps(scene)};
+        const state = stateFrom("run=0.5&period=0.5", scene, problems);
+        console.log(JSON.stringify([state.run ?? null, state.period, problems]));"""
+    run, period, problems = json.loads(in_node("link", then=then))
+    assert run is None and period == 0.5
+    assert problems == ["The link asks for run 0.5, but here are 0 to 1."]
 
 
 def pixels(page, **options):

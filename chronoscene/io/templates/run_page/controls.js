@@ -80,9 +80,9 @@ const FLIGHT = {
 
 /** Let keys fly while they are held, and call `app.keys` once for each of the others. */
 function listenToKeys(app) {
-  const held = new Set();
+  const held = new Map();  // By the place of the key: its sign is another one once Shift is let go
   const fly = () => {
-    for (const key of held) app.move(view => FLIGHT[key](view, app.up));
+    for (const key of held.values()) app.move(view => FLIGHT[key](view, app.up));
     if (held.size) requestAnimationFrame(fly);
   };
   document.addEventListener("keydown", event => {
@@ -93,13 +93,9 @@ function listenToKeys(app) {
     if (FLIGHT[key]) {
       event.preventDefault();
       if (!held.size) requestAnimationFrame(fly);
-      held.add(key);
+      held.set(event.code, key);
     } else if (!event.repeat && app.key(plain)) event.preventDefault();
   });
-  document.addEventListener("keyup", event => {
-    const key = event.key.toLowerCase();
-    held.delete(key);
-    held.delete(`shift+${key}`);
-  });
+  document.addEventListener("keyup", event => held.delete(event.code));
   addEventListener("blur", () => held.clear());
 }

@@ -23,15 +23,15 @@ function addressOf(state) {
 /** Read an address; `problems` gets a sentence for each part that this page cannot show. */
 function stateFrom(address, scene, problems) {
   const values = new URLSearchParams(address), state = {}, last = scene.periods.length - 1;
-  const number = (name, high, what) => {
+  const number = (name, high, what, fits = () => true) => {
     if (!values.has(name)) return undefined;
     const value = values.get(name).trim() === "" ? NaN : Number(values.get(name));
-    if (value >= 0 && value <= high) return value;
+    if (value >= 0 && value <= high && fits(value)) return value;
     problems.push(`The link asks for ${what} ${values.get(name)}, but here are 0 to ${high}.`);
     return undefined;
   };
   state.period = number("period", last, "period");
-  state.run = number("run", scene.runs.length - 1, "run");
+  state.run = number("run", scene.runs.length - 1, "run", Number.isInteger);
   state.wipe = number("wipe", 1, "the wipe at");
   const mode = values.get("mode");
   if (["wipe", "blink"].includes(mode)) state.mode = mode;
