@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -198,12 +199,12 @@ def _document(
         "frustum": float(FRUSTUM * EXTENT * np.sqrt(len(periods) / len(frames))),
         "runs": [
             {
-                "name": run.spec.title,
+                "name": name,
                 "file": f"run-{i}",
                 "near": _near_plane(run) * page_from_world.scale,
                 "antialiased": run.is_filtered,
             }
-            for i, run in enumerate(runs)
+            for i, (run, name) in enumerate(zip(runs, _names(runs), strict=True))
         ],
         "frames": [
             {
@@ -216,6 +217,22 @@ def _document(
             for frame, pose in zip(frames, poses, strict=True)
         ],
     }
+
+
+def _names(runs: Sequence[TrainedRun]) -> list[str]:
+    """Name runs by their methods, and by the rest of their settings where a method is there twice.
+
+    A run that is there twice has the same name twice.
+    """
+    records = [run.record for run in runs]
+    settings = [", ".join(filter(None, (r.strategy, r.preset, r.variant))) for r in records]
+    names = [run.spec.title for run in runs]
+    longer = [f"{name} ({setting})" for name, setting in zip(names, settings, strict=True)]
+    longest = [f"{name[:-1]}, seed {r.seed})" for name, r in zip(longer, records, strict=True)]
+    for more in (longer, longest):
+        count = Counter(names)
+        names = [m if count[n] > 1 else n for n, m in zip(names, more, strict=True)]
+    return names
 
 
 def _camera(camera: Camera, cam_from_page: Array) -> dict[str, Any]:

@@ -119,6 +119,17 @@ def test_one_period_of_two_methods(trained, tmp_path):
     assert len(scene["frames"]) == 4
 
 
+def test_runs_of_one_method_are_told_apart(trained, tmp_path):
+    again = tmp_path / "ring" / "chronogs-joint-fast" / "seed1"
+    shutil.copytree(trained["chronogs"], again)
+    record = json.loads((again / "run.json").read_text(encoding="utf-8"))
+    (again / "run.json").write_text(json.dumps(record | {"seed": 1}), encoding="utf-8")
+    make_page([trained["chronogs"], trained["4dgs"], again], tmp_path / "page")
+    first, other, second = (run["name"] for run in scene_of(tmp_path / "page")["runs"])
+    assert first.startswith("ChronoGS (joint, ") and first.endswith(", seed 0)")
+    assert second == first.replace("seed 0", "seed 1") and other == "4DGS"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
