@@ -93,7 +93,7 @@ def write_page(
         clouds = _gaussians(runs, scene, periods, page_from_world, report)
         document = _document(runs, scene, frames, periods, page_from_world, clouds[0][0])
         photos = _Photos(ImageStore(scene, max_width=runs[0].record.max_width), staged)
-        room = max_bytes - len(_page(document, Reduction(), runs, periods, 0))
+        room = max_bytes - _size_of_rest(document, runs, periods)
         for frame in _test_first(frames):
             if frame.split == "test" and photos.size < TEST_PHOTO_SHARE * max_bytes:
                 photos.add(frame, room)
@@ -109,7 +109,7 @@ def write_page(
         missing = len(frames) - len(photos.files)
         (staged / "data").mkdir()
         for item, each in zip(document["runs"], packed, strict=True):
-            text = f"viewer.receive({json.dumps(item['file'])},{each.text});\n"
+            text = _script(item["file"], each.text)
             (staged / "data" / f"{item['file']}.js").write_text(text, encoding="ascii")
         page = _page(document, reduction, runs, periods, missing)
         (staged / "index.html").write_text(page, encoding="utf-8", newline="\n")
@@ -287,7 +287,7 @@ class _Photos:
             return
         data = _jpeg(self._store.load(frame))
         if self.size + len(data) <= room:
-            name = f"photos/{len(self.files):05}.jpg"
+            name = _photo_file(len(self.files))
             (self._folder / name).write_bytes(data)
             self.files[frame.name] = name
             self.size += len(data)
@@ -300,6 +300,25 @@ def _jpeg(pixels: NDArray[np.uint8]) -> bytes:
     picture.thumbnail((PHOTO_SIDE, PHOTO_SIDE))
     picture.save(file, "jpeg", quality=PHOTO_QUALITY)
     return file.getvalue()
+
+
+def _script(file: str, gaussians: str) -> str:
+    return f"viewer.receive({json.dumps(file)},{gaussians});\n"
+
+
+def _size_of_rest(
+    document: dict[str, Any], runs: Sequence[TrainedRun], periods: Sequence[int]
+) -> int:
+    """Return how many bytes a page takes at most without its Gaussians and photos."""
+    # All photos have names, and each note is there.
+    frames = [frame | {"photo": _photo_file(0)} for frame in document["frames"]]
+    least = Reduction(degree=1, share=0.5)
+    page = _page(document | {"frames": frames}, least, runs, periods, len(frames))
+    return len(page.encode()) + sum(len(_script(run["file"], "")) for run in document["runs"])
+
+
+def _photo_file(number: int) -> str:
+    return f"photos/{number:05}.jpg"
 
 
 def _page(

@@ -119,6 +119,18 @@ def test_one_period_of_two_methods(trained, tmp_path):
     assert len(scene["frames"]) == 4
 
 
+def test_all_files_together_keep_the_limit(trained, tmp_path):
+    def size_of(page):
+        return sum(path.stat().st_size for path in page.rglob("*.*"))
+
+    make_page([trained["chronogs"]], tmp_path / "whole")
+    whole = size_of(tmp_path / "whole")
+    for lacking in (1, 150, 400):  # bytes; names of photos and notes count, too
+        out, limit = tmp_path / f"less{lacking}", whole - lacking
+        make_page([trained["chronogs"]], out, "--max-megabytes", limit / 1e6)
+        assert size_of(out) <= limit
+
+
 def test_runs_of_one_method_are_told_apart(trained, tmp_path):
     again = tmp_path / "ring" / "chronogs-joint-fast" / "seed1"
     shutil.copytree(trained["chronogs"], again)
