@@ -16,7 +16,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import safe_part, to_bytes
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
-from chronoscene.io.wording import counted
+from chronoscene.io.wording import counted, printable
 from chronoscene.methods import Prediction, View
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame, Scene
@@ -135,6 +135,8 @@ def period_files(labels: Mapping[str, str], kind: str) -> dict[int, str]:
     """
     count = Counter(labels.values())
     names = {k: name if count[name] == 1 else f"{name}_{k}" for k, name in labels.items()}
+    if len({*names.values()}) < len(names):  # "May_0" is the label of another one
+        names = {k: f"{name}_{k}" for k, name in labels.items()}
     suffix = splat_files.SUFFIXES[kind]
     return {int(k): f"{safe_part(name)}{suffix}" for k, name in names.items()}
 
@@ -228,7 +230,7 @@ def _adapted(
 def _comments(
     run: TrainedRun, scene: Scene, period: float, prepared: Prepared, loss: ExportLoss | None
 ) -> tuple[str, ...]:
-    """Return what a file says of itself, in ASCII as PLY has it."""
+    """Return what a file says of itself, in lines of ASCII as PLY has them."""
     label = run.record.period_labels.get(f"{period:g}", "")
     of_period = f"period {period:g} {label if label != f'{period:g}' else ''}".strip()
     kind = "with" if prepared.antialiased else "without"
@@ -241,7 +243,7 @@ def _comments(
         lines.append("The exposure is in the colours; a viewer lacks it where background shows")
     if prepared.offset.any():
         lines.append(_describe_offset(scene, prepared.offset))
-    return tuple(line.encode("ascii", "replace").decode() for line in lines)
+    return tuple(printable(line).encode("ascii", "replace").decode() for line in lines)
 
 
 def _describe_loss(loss: ExportLoss | None, antialiased: bool) -> str:

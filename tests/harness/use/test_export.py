@@ -243,3 +243,17 @@ def test_periods_of_the_same_label_have_files_of_their_own():
     labels = {"0": "May", "1": "June", "2": "May"}
     names = {0: "May_0.ply", 1: "June.ply", 2: "May_2.ply"}
     assert exporting.period_files(labels, "ply") == names
+    files = exporting.period_files({"0": "May", "1": "May", "2": "May_0"}, "ply")
+    assert files == {0: "May_0.ply", 1: "May_1.ply", 2: "May_0_2.ply"}
+
+
+def test_a_label_of_two_lines_is_one_line_of_the_file(trained, tmp_path):
+    run = open_run(trained["4dgs"])
+    record = run.record.model_copy(
+        update={"period_labels": {"0": "May\nend_header", "1": "J\u00fa"}}
+    )
+    run, scene = dataclasses.replace(run, record=record), run.scene()
+    made = exporting.make_file(run, scene, 0.0, exporting.prepare(run, scene, 0.0), "ply")
+    (tmp_path / "a.ply").write_bytes(made.data)
+    comments = PlyData.read(tmp_path / "a.ply").comments
+    assert comments == list(made.comments) and comments[0].endswith(r"period 0 May\nend_header")
