@@ -103,8 +103,15 @@ def parse_pair(labels: Sequence[str], names: Sequence[str]) -> tuple[int, int]:
         names: Values of the option ``--between``.
 
     Raises:
-        ConfigError: If one is unknown, or they are equal.
+        ConfigError: If one is unknown, or they are equal, or several periods have a label.
     """
+    if shared := [name for name in names if labels.count(name) > 1]:
+        raise ConfigError(
+            f"--between {' '.join(names)}",
+            expected="labels of one period each",
+            found=f"{shared[0]!r}, the label of several",
+            todo="name them by their numbers",
+        )
     known = {str(i): i for i in range(len(labels))} | {label: i for i, label in enumerate(labels)}
     first, second = sorted(known.get(name, -1) for name in names)
     if first < 0 or first == second:

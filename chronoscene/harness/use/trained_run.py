@@ -114,11 +114,18 @@ class TrainedRun:
         """Return the period that a label or a number names.
 
         Raises:
-            ConfigError: If no period has this label or number.
+            ConfigError: If no period has this label or number, or several have the label.
         """
-        for number, label in self.record.period_labels.items():
-            if label == text:
-                return float(number)
+        named = [i for i, label in self.record.period_labels.items() if label == text]
+        if len(named) > 1:
+            raise ConfigError(
+                f"period {text!r}",
+                expected="the label of one period",
+                found=f"that of {' and '.join(named)}",
+                todo="name it by its number",
+            )
+        if named:
+            return float(named[0])
         try:
             period = float(text)
         except ValueError:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from chronoscene.cli.runs.changes import parse_pair
 from chronoscene.errors import ConfigError
 from chronoscene.harness.use.cameras import Viewpoint
 from chronoscene.harness.use.changes import (
@@ -171,3 +172,9 @@ def test_colours_that_one_map_explains_but_for_a_few():
     found = unexplained(first, second, counted)
     assert (found[:10] == 0).all()
     assert found[20:].max() < 1e-3 < 0.02 < np.median(found[10:20])
+
+
+def test_a_label_of_two_periods_names_neither():
+    with pytest.raises(ConfigError, match="--between May 1: expected labels of one period each"):
+        parse_pair(["May", "May"], ("May", "1"))
+    assert parse_pair(["May", "May", "June"], ("June", "1")) == (1, 2)

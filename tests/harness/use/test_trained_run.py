@@ -107,6 +107,14 @@ def test_a_label_is_a_label_whatever_it_looks_like(runs):
     assert (run.parse_periods("1"), run.parse_periods("12:30")) == ((0,), (1,))
 
 
+def test_a_label_of_two_periods_names_neither(runs):
+    run = open_run(folder_of(runs), plugin=TOY)
+    run.record.period_labels = {"0": "May", "1": "May"}
+    with pytest.raises(ConfigError, match="'May': expected the label of one period, found that of"):
+        run.parse_period("May")
+    assert run.parse_period("1") == 1
+
+
 @pytest.mark.parametrize(
     ("strategy", "period", "message"),
     [
