@@ -11,7 +11,7 @@ import csv
 import io
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from chronoscene.io.wording import printable
@@ -111,7 +111,9 @@ def boxed_text(table: Table, *, width: int | None = None) -> str:
         [_marked(table, i, j, printable(cell), "table") for j, cell in enumerate(row)]
         for i, row in enumerate(table.rows)
     ]
-    columns = zip(*(zip(*table.heads, strict=True)), *rows, strict=True)
+    heads = [(printable(first), printable(second)) for first, second in table.heads]
+    table = replace(table, heads=heads)
+    columns = zip(*(zip(*heads, strict=True)), *rows, strict=True)
     sizes = [GAP + max(map(cell_len, column)) for column in columns]
     if width is None or 1 + sum(sizes) <= width:
         return title + _block(table, rows, range(len(sizes)))
@@ -178,8 +180,8 @@ def markdown(table: Table, *, special: str = r"\`*<>|[]") -> str:
     """
     lines = []
     if table.title:
-        lines += [f"**{escape_markdown(table.title)}**", ""]
-    lines.append(_piped([escape_markdown(head) for head in table.flat_heads]))
+        lines += [f"**{escape_markdown(printable(table.title))}**", ""]
+    lines.append(_piped([escape_markdown(printable(head)) for head in table.flat_heads]))
     rule = ["---"] * table.labels + ["---:"] * (len(table.heads) - table.labels)
     lines.append(_piped(rule))
     for i, row in enumerate(table.rows):
@@ -204,7 +206,7 @@ def latex(table: Table, *, cmidrules: bool = False) -> str:
         table: What to write.
         cmidrules: Whether to draw rules under heads of several columns.
     """
-    lines = [f"% {table.title}"] if table.title else []
+    lines = [f"% {printable(table.title)}"] if table.title else []
     lines += [
         rf"\begin{{tabular}}{{{'l' * table.labels}{'r' * (len(table.heads) - table.labels)}}}",
         r"\toprule",

@@ -14,6 +14,7 @@ from chronoscene.io.tables import (
     latex,
     markdown,
     plain_text,
+    text_of,
 )
 
 HEADS = [("name", ""), ("size", "[m]"), ("", "[px]")]
@@ -46,6 +47,15 @@ def test_markdown():
         r"| \[c | **30.5** | 4 |",
     ]
     assert r"a\_b" in markdown(TABLE, special="_")
+
+
+@pytest.mark.parametrize("style", ["table", "markdown", "latex"])
+def test_names_of_several_lines_are_on_one(style):
+    odd = Table([("a\nb", ""), ("c\rd", "e\nf")], [["g\nh", "1"]], title="i\nj")
+    plain = Table([("a", ""), ("c", "e")], [["g", "1"]], title="i")
+    found = text_of(odd, style)
+    assert found.count("\n") == text_of(plain, style).count("\n")
+    assert "\r" not in found and found.splitlines()[0].endswith(("j", "j**"))
 
 
 @pytest.mark.parametrize("cmidrules", [False, True])

@@ -33,6 +33,7 @@ from chronoscene.harness.report.summary import (
 )
 from chronoscene.io import tables
 from chronoscene.io.tables import Head, Table
+from chronoscene.io.wording import printable
 from chronoscene.metrics.registry import all_metrics, metric_info
 
 if TYPE_CHECKING:
@@ -168,7 +169,7 @@ def tables_text(
         texts, bullet = [tables.latex(table, cmidrules=True) for table in made], "% "
     else:
         texts, bullet = [tables.boxed_text(table, width=width) for table in made], ""
-    return "\n".join([*texts, "".join(f"{bullet}{note}\n" for note in notes)])
+    return "\n".join([*texts, "".join(f"{bullet}{printable(note)}\n" for note in notes)])
 
 
 def json_entry(entry: dict[str, Any]) -> dict[str, Any]:
