@@ -2,6 +2,9 @@
 
 import csv
 import itertools
+import re
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +116,55 @@ class Opened:
         download.value.save_as(path)
         lines = [r for r in path.read_text().splitlines() if not r.startswith("#")]
         return list(csv.DictReader(lines))
+
+
+STAGE = """
+const made = new Map(), pen = new Proxy({}, { get: () => () => {}, set: () => true });
+const element = id => made.get(id) || made.set(id, {
+  value: "", clientWidth: 300, clientHeight: 200, getContext: () => pen, select() {}, append() {},
+  addEventListener() {}, setAttribute() {}, replaceChildren() {}, click() {},
+}).get(id);
+globalThis.document = { getElementById: element, querySelectorAll: () => [],
+  querySelector: () => null, createElement: () => element("new") };
+globalThis.ResizeObserver = class { observe() {} };
+globalThis.Image = class {};
+globalThis.addEventListener = () => {};
+globalThis.devicePixelRatio = 1;
+let content;
+URL.createObjectURL = blob => { content = blob; };
+URL.revokeObjectURL = () => {};
+const enter = (id, value) => {
+  $(id).value = value;
+  $(id).onchange({ target: $(id) });
+};
+"""
+
+
+def test_a_point_with_coordinates_is_no_tie_point(page: Path, tmp_path: Path) -> None:
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no node here")
+    *_, script = re.findall("<script>(.*?)</script>", page.read_text(), re.DOTALL)
+    then = """
+        choose(0); enter("role", "tie");
+        console.error($("role").value, $("status").textContent);
+        enter("world", "");
+        console.error(state.points[point].role);
+        enter("world", "500000.5 5320000.25 12");
+        enter("role", "check"); save();
+        content.text().then(text => console.log(text));"""
+    (tmp_path / "page.js").write_text(STAGE + script + then)
+    started = [node, str(tmp_path / "page.js")]
+    done = subprocess.run(started, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    said = done.stderr.splitlines()
+    assert (
+        said[0].startswith("check A point with coordinates is control or check")
+        and said[1] == "tie"
+    )
+    (tmp_path / "points.csv").write_text(done.stdout)
+    roles = {p.name: p.role for p in read_tie_points(tmp_path / "points.csv").points}
+    assert roles == {"</script><b>": "check", "unseen": "control"}
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])

@@ -119,6 +119,8 @@ for (const field of ["name", "role", "world", "sigma"]) $(field).onchange = e =>
     say("Give three numbers: east, north, height.");
   else if (field === "sigma" && numbers.length && !(three && numbers.every(v => v > 0)))
     say("Give three numbers above 0: metres east, north, up.");
+  else if (field === "role" && value === "tie" && state.points[point].world)
+    say("A point with coordinates is control or check: clear them for a tie point.");
   else return change(() => {
     const chosen = state.points[point];
     chosen[field] = value;
