@@ -14,6 +14,7 @@ import numpy as np
 
 from chronoscene.colmap.model import Model, PosedImage, read_model
 from chronoscene.images.decoding import load_photo
+from chronoscene.images.store import resize_camera
 from chronoscene.io.pages import data_uri, render_page
 from chronoscene.io.processes import Report
 from chronoscene.registration.photos.inputs import plain_names
@@ -78,9 +79,11 @@ def _photo(capture: Capture, image: PosedImage | None, max_size: int) -> dict[st
     picture.thumbnail((max_size, max_size), Image.Resampling.LANCZOS)
     camera = None
     if image is not None and image.camera.model in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS):
-        named = CAMERA_MODELS[image.camera.model].distortion
-        values = dict(zip(named, image.camera.distortion, strict=True))
-        K = image.camera.K
+        # Other programs make models of photos that they have reduced.
+        resized = resize_camera(image.camera, capture.width, capture.height)
+        named = CAMERA_MODELS[resized.model].distortion
+        values = dict(zip(named, resized.distortion, strict=True))
+        K = resized.K
         camera = {
             "pose": image.cam_from_world[:3].tolist(),
             "intrinsics": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],

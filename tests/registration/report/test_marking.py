@@ -5,6 +5,7 @@ import itertools
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from chronoscene.cli.scenes.mark import command
 from chronoscene.colmap.model import write_model
+from chronoscene.images.store import resize_camera
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.report.marking import marking_page
 from chronoscene.registration.ties.tie_points import read_tie_points
@@ -35,8 +37,6 @@ def captures(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The true poses as a COLMAP model, under the names of the captures."""
-    from dataclasses import replace
-
     folder = tmp_path_factory.mktemp("model")
     known = {Path(name).name: name for name in NAMES}
     frames = [replace(f, name=known.get(f.name, f.name)) for f in truth.frames]
@@ -65,6 +65,27 @@ def test_nothing_is_loaded_and_names_are_escaped(page: Path) -> None:
     assert "http://" not in text and "https://" not in text
     assert "</script><b>" not in text
     assert text.count("data:image/jpeg") == len(NAMES)
+
+
+def test_a_model_of_reduced_photos_predicts_in_the_whole_ones(
+    captures: Path, truth: Scene, page: Path, tmp_path: Path
+) -> None:
+    known = {Path(name).name: name for name in NAMES}
+    frames = [
+        replace(f, name=known.get(f.name, f.name), camera=resize_camera(f.camera, w // 2, h // 2))
+        for f in truth.frames
+        for w, h in [f.camera.size]
+    ]
+    (tmp_path / "half").mkdir()
+    write_model(tmp_path / "half", frames, truth.points)
+    text = marking_page(read_captures(captures).images, model=tmp_path / "half", max_size=200)
+    numbers = re.compile(r'"intrinsics": \[(.*?)\]')
+    whole, reduced = (
+        np.array([line.split(",") for line in numbers.findall(each)], float)
+        for each in (page.read_text(), text)
+    )
+    assert len(whole) == len(NAMES)
+    np.testing.assert_allclose(reduced, whole)
 
 
 def test_the_command_writes_a_page(captures: Path, tmp_path: Path) -> None:
