@@ -44,7 +44,7 @@ def orbit(
 
     Args:
         poses: ``cam_from_world`` of the cameras. [C, 4, 4]
-        points: Points of the scene. [P, 3]
+        points: Points of the scene; those that are not finite do not count. [P, 3]
         count: Number of poses.
         radius: Level distance from the median of the points; None for the median distance of the
             cameras.
@@ -53,7 +53,7 @@ def orbit(
     Returns:
         poses: The end of the path leads to its beginning. [count, 4, 4]
     """
-    up, target = find_up(poses), np.median(points, axis=0)
+    up, target = find_up(poses), np.median(points[np.isfinite(points).all(axis=1)], axis=0)
     offsets = camera_centre(poses) - target
     heights = offsets @ up
     level = offsets - heights[:, None] * up

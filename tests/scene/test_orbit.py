@@ -73,3 +73,9 @@ def test_up_is_up_where_cameras_look_straight_down(headings):
 def test_one_camera_right_above():
     down = look_at(MIDDLE + 10 * UP, MIDDLE, up=NORTH)[None]
     assert np.isfinite(orbit(down, MIDDLE[None], 4)).all()
+
+
+def test_points_that_are_not_finite_do_not_count():
+    poses, lost = ring(np.linspace(0.4, 6.4, 20)), [[np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]]
+    found = orbit(poses, np.concatenate([lost, POINTS]), 4)
+    np.testing.assert_array_equal(found, orbit(poses, POINTS, 4))

@@ -1,6 +1,7 @@
 """``chronoscene page``: what is in the folder, what a browser shows of it, and what is refused."""
 
 import base64
+import dataclasses
 import errno
 import json
 import os
@@ -16,7 +17,7 @@ from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, ConfigError, DiskFullError, SceneError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use import page_gaussians
-from chronoscene.harness.use.page import EXTENT
+from chronoscene.harness.use.page import EXTENT, write_page
 from chronoscene.harness.use.page_gaussians import Reduction, fit_gaussians, pack, unite
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.pages import TEMPLATES
@@ -110,6 +111,16 @@ def test_the_folder(trained, tmp_path):
     assert "Gaussians of 2 periods" in said and "left out" not in said
     page = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
     assert not re.search(r"https?:|@import|url\(|fetch\(|import\(", page)
+
+
+def test_a_place_that_is_not_finite_leaves_the_first_view(trained, tmp_path):
+    run = open_run(trained["4dgs"])
+    scene = run.scene()
+    xyz = scene.points.xyz.copy()
+    xyz[0] = np.nan
+    scene = dataclasses.replace(scene, points=dataclasses.replace(scene.points, xyz=xyz))
+    write_page([run], tmp_path / "page", scene, [0], max_bytes=1e7, report=lambda *_: None)
+    assert np.isfinite(scene_of(tmp_path / "page")["home"]["eye"]).all()
 
 
 def test_one_period_of_two_methods(trained, tmp_path):
