@@ -14,6 +14,8 @@ from PIL import Image
 from chronoscene.io.staging import replacing
 
 SUFFIXES = (".mp4", ".webp")
+WEBP_SIDE = 16383
+"""Largest width and height of WebP, in pixels."""
 
 _BT709 = 1  # Its number in the tables of H.264
 _CRF = "18"  # Of x264: hardly visible

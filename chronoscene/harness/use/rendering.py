@@ -12,7 +12,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import encode_png, to_bytes
 from chronoscene.harness.use.cameras import Viewpoint
 from chronoscene.harness.use.trained_run import TrainedRun
-from chronoscene.images.animation import SUFFIXES, write_animation
+from chronoscene.images.animation import SUFFIXES, WEBP_SIDE, write_animation
 from chronoscene.io.staging import staged_folder
 
 
@@ -23,7 +23,7 @@ def check_viewpoints(
 
     Raises:
         ConfigError: If the run has no such period, or cannot combine two, or an animation would
-            have pictures of several sizes.
+            have pictures of several sizes, or larger ones than its format has.
         CheckpointError: If a model is missing.
     """
     for period in {viewpoint.period for viewpoint in viewpoints}:
@@ -39,6 +39,13 @@ def check_viewpoints(
             expected="cameras of one size",
             found=", ".join(f"{w} x {h}" for w, h in sizes[:4]),
             todo="name a folder, for PNG files",
+        )
+    if out.suffix.lower() == ".webp" and max(sizes[0]) > WEBP_SIDE:
+        raise ConfigError(
+            f"--out {out}",
+            expected=f"pictures of at most {WEBP_SIDE} pixels a side, as WebP has no larger ones",
+            found="{} x {}".format(*sizes[0]),
+            todo="choose a smaller size, or .mp4",
         )
 
 

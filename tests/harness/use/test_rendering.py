@@ -104,6 +104,13 @@ def test_a_film_has_one_size(trained, tmp_path, monkeypatch):
         render(folder, tmp_path / "film.mp4")
 
 
+def test_webp_has_a_largest_side(trained, tmp_path):
+    options = ("--cameras", "orbit", "--period", "0", "--frames", "2", "--size", "16384x1")
+    with pytest.raises(ConfigError, match=r"at most 16383 pixels a side.*found 16384 x 1"):
+        render(trained["4dgs"], tmp_path / "film.webp", *options)
+    assert not list(tmp_path.iterdir())
+
+
 def test_places_that_are_refused(trained, scene_folder, tmp_path):
     folder = trained["chronogs"]
     with pytest.raises(ConfigError, match="a place outside the scene"):
