@@ -229,6 +229,17 @@ def test_a_key_ends_its_flight_though_shift_was_let_go_before_it():
     assert in_node("vectors", "view", "controls", then=KEYS) == "2\n"
 
 
+def test_only_nine_periods_have_keys():
+    then = """
+        globalThis.document = { createElement: () => ({ addEventListener() {} }) };
+        const byId = () => ({ append() {} }), app = { scene: { periods: [..."abcdefghijk"] } };
+        const panel = { app };
+        Panel.prototype.fillTicks.call(panel);
+        console.log(JSON.stringify(panel.ticks.map(tick => tick.title)));"""
+    titles = json.loads(in_node("panel", then=then))
+    assert titles[8:] == ["Show i (key 9)", "Show j", "Show k"]
+
+
 def test_a_link_to_half_a_run_is_refused():
     scene = {"periods": ["a", "b"], "runs": [{}, {}], "frames": []}
     then = f"""

@@ -30,7 +30,7 @@ class Panel {
     this.ticks = scene.periods.map((name, i) => {
       const tick = document.createElement("button");
       tick.textContent = name;
-      tick.title = `Show ${name} (key ${i + 1})`;
+      tick.title = `Show ${name}` + (i < 9 ? ` (key ${i + 1})` : "");
       tick.addEventListener("click", () => this.app.setPeriod(i));
       byId("ticks").append(tick);
       return tick;
