@@ -122,9 +122,9 @@ def add_legend(figure: Any, entries: Sequence[tuple[str, str]], columns: int, **
     )
 
 
-def short_name(name: str) -> str:
-    """Shorten a name for a legend."""
-    return shorten(printable(name), 28, placeholder="...") or name[:28]
+def short_name(name: str, length: int = 28) -> str:
+    """Shorten a name for a legend, or to another number of characters."""
+    return shorten(printable(name), length, placeholder="...") or name[:length]
 
 
 def quiet_axes(axes: Any) -> None:

@@ -12,7 +12,7 @@ from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE
 from chronoscene.cli.output import emit, report_written, say, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
-from chronoscene.figures.canvas import rgb_of
+from chronoscene.figures.canvas import rgb_of, short_name
 from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
 from chronoscene.figures.cloud import cloud_of
 from chronoscene.formats.shared.ply import write_vertices
@@ -22,6 +22,7 @@ from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import boxed_text
 
+TITLE = 40  # Letters of both labels that fit above a map
 BETWEEN = click.option(
     "--between",
     nargs=2,
@@ -139,5 +140,9 @@ def _write_cloud(path: Path, made: ChangeMap) -> None:
 
 
 def _panel(made: ChangeMap, labels: Mapping[str, str]) -> ChangePanel:
-    title = " \N{RIGHTWARDS ARROW} ".join(labels[str(period)] for period in made.periods)
+    names = [labels[str(period)] for period in made.periods]
+    if sum(map(len, names)) > TITLE:  # numbers tell apart what begins alike
+        shown = zip(made.periods, names, strict=True)
+        names = [short_name(f"{period}: {name}", TITLE // 2) for period, name in shown]
+    title = " \N{RIGHTWARDS ARROW} ".join(names)
     return ChangePanel(title, made.xyz, made.classes)

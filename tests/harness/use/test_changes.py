@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.cli.runs.changes import parse_pair
+from chronoscene.cli.runs.changes import _panel, parse_pair
 from chronoscene.errors import ConfigError
 from chronoscene.harness.use.cameras import Viewpoint
 from chronoscene.harness.use.changes import (
     CLASSES,
     GEOMETRY,
+    ChangeMap,
     back_project,
     map_changes,
     unexplained,
@@ -178,3 +179,12 @@ def test_a_label_of_two_periods_names_neither():
     with pytest.raises(ConfigError, match="--between May 1: expected labels of one period each"):
         parse_pair(["May", "May"], ("May", "1"))
     assert parse_pair(["May", "May", "June"], ("June", "1")) == (1, 2)
+
+
+def test_titles_of_maps_are_no_wider_than_these():
+    made = ChangeMap((0, 1), np.zeros((1, 3)), *np.zeros((2, 1), bool), *np.zeros((2, 1)))
+    known = {"0": "before the works", "1": "after the works"}
+    assert _panel(made, known).title == "before the works \N{RIGHTWARDS ARROW} after the works"
+    survey = "survey of the year {} by helicopter"
+    title = _panel(made, {"0": survey.format(1970), "1": survey.format(1971)}).title
+    assert title == "0: survey of the... \N{RIGHTWARDS ARROW} 1: survey of the..."
