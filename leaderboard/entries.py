@@ -80,8 +80,13 @@ class EntryRun(BaseModel):
         if not record.periods or not record.periods.keys() <= record.period_labels.keys():
             raise ValueError("a period without a label, or no period")
         check_effort(record)
-        check_scene(record, [(view.view, view.period) for view in self.views])
+        check_scene(record, [(view.view, view.period) for view in self.scored])
         return self
+
+    @property
+    def scored(self) -> list[ScoredView]:
+        """Views that have values."""
+        return [view for view in self.views if view.values]
 
     @property
     def images(self) -> dict[str, str]:
@@ -116,6 +121,8 @@ class MeasuredEntry(BaseModel):
                 raise ValueError(f"runs that differ in {name}")
         if len({run.record.seed for run in self.runs}) < len(self.runs):
             raise ValueError("a seed twice")
+        if len({frozenset(view.view for view in run.scored) for run in self.runs}) > 1:
+            raise ValueError("seeds with values of different views")
         for one, other in combinations(self.runs, 2):
             if {*one.images.items()} & {*other.images.items()}:
                 seeds = f"{one.record.seed} and {other.record.seed}"

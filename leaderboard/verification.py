@@ -66,7 +66,7 @@ def check_values(entry: Path, part: EntryRun, scores: Scores) -> None:
         ConfigError: If one differs by more than `TOLERANCE`, or is that of the photo itself; or if
             other views have values.
     """
-    given = {view.view for view in part.views if view.values}
+    given = {view.view for view in part.scored}
     scored = {row.view for row in scores.rows if row.region == ALL}
     if scored and (wrong := sorted(given ^ scored)):
         found = f"values of {wrong[0]!r}, whose mask ignores every pixel"

@@ -1,10 +1,15 @@
 """Entries are read as they were written; what cannot be true is refused in one line."""
 
 import json
+from pathlib import Path
 
 import pytest
 
+import leaderboard
 from chronoscene.errors import ConfigError
+from chronoscene.harness.files.records import ViewScore
+from chronoscene.harness.score.regions import ALL
+from chronoscene.harness.score.scoring import aggregate
 from leaderboard.board import read_board
 from leaderboard.entries import read_entry
 
@@ -136,3 +141,29 @@ def test_the_first_of_two_files_of_one_entry_counts(path):
     assert len(board.standings) == 1
     assert "z.json: expected a measured entry" in board.notices[0]
     assert f"the same runs as {path}" in board.notices[0]
+
+
+def hide_hardest(run):
+    """Take the values of the view that the run renders worst, with the means that follow."""
+    min(run["views"], key=lambda view: view["values"]["psnr"])["values"] = {}
+    rows = [
+        ViewScore(v["view"], v["period"], v["period"], ALL, metric, value)
+        for v in run["views"]
+        for metric, value in v["values"].items()
+    ]
+    run["record"]["aggregates"], run["record"]["periods"] = aggregate(rows)
+
+
+def test_hard_views_cannot_be_left_without_values(path):
+    document = json.loads(path.read_text())
+    hide_hardest(document["runs"][0])
+    path.write_text(json.dumps(document))
+    with pytest.raises(ConfigError, match="seeds with values of different views"):
+        read_entry(path)
+    scenes = Path(leaderboard.__file__).parent / "entries" / "measured"
+    document = json.loads(next((scenes / "ranking-street").glob("*.json")).read_text())
+    for run in document["runs"]:
+        hide_hardest(run)
+    path.write_text(json.dumps(document))
+    with pytest.raises(ConfigError, match="other views or periods than the test views of"):
+        read_entry(path)

@@ -212,7 +212,7 @@ console.log(moves);
 
 
 def in_node(*scripts, then):
-    """What some scripts of the page print with a few lines more, without a browser."""
+    """Run some scripts of the page with a few more lines, without a browser; return the output."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("no node here")
