@@ -122,6 +122,23 @@ def test_opaque_gaussians_end_pixels(tools: SimpleNamespace, check_agreement: Ch
     assert (comparison.expected["alphas"] > 0.9999 - 1e-3).mean() > 0.5
 
 
+def test_opaque_gaussians_just_outside_the_image(
+    tools: SimpleNamespace, check_agreement: Check
+) -> None:
+    """Of a block that reaches over the edge, the pixels outside let no light through."""
+    count = 100
+    scene = tools.random_scene(count, 5, 5)
+    check_agreement(
+        scene.with_(
+            means=np.tile(np.array([[0.83, 0, 2.5]], np.float32), (count, 1)),
+            scales=np.full((count, 3), 0.01, np.float32),
+            opacities=np.full(count, 0.99, np.float32),
+            viewmats=np.eye(4, dtype=np.float32)[None],
+            Ks=np.array([[[10, 0, 2.5], [0, 10, 2.5], [0, 0, 1]]], np.float32),
+        )
+    )
+
+
 @pytest.mark.parametrize(
     "change",
     [

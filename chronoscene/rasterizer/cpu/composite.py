@@ -109,7 +109,11 @@ def power_at(gaussian: Any, block: Any, part: int, state: Any, steps: int) -> An
 
 @inner(fast_math=True)
 def _start_tile(left, top, width, height, state, planes, plane, end):
-    """Light everywhere but in pixels outside the image. Returns the blocks inside."""
+    """Light everywhere but in pixels outside the image. Returns the blocks inside.
+
+    No entry counts in the pixels outside: on the way back their light would else be divided by
+    what passes each of the entries of their block, without an end.
+    """
     transmittance, last = planes
     transmittance[plane : plane + layout.TILE_PIXELS] = np.float32(1.0)
     active = np.uint64(0)
@@ -117,17 +121,20 @@ def _start_tile(left, top, width, height, state, planes, plane, end):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
         at = _STATE * block
         state[at + 16 : at + 64] = np.float32(0.0)
-        last[plane + 16 * block : plane + 16 * block + 16] = end
+        kept = plane + 16 * block
         if x + 4 <= width and y + 4 <= height:
             state[at : at + 16] = np.float32(1.0)
+            last[kept : kept + 16] = end
             active |= np.uint64(1) << np.uint64(block)
             continue
         state[at : at + 16] = np.float32(0.0)
+        last[kept : kept + 16] = np.int32(-1)
         if x < width and y < height:
             active |= np.uint64(1) << np.uint64(block)
             for row in range(min(4, height - y)):
                 for column in range(min(4, width - x)):
                     state[at + 4 * row + column] = np.float32(1.0)
+                    last[kept + 4 * row + column] = end
     return active
 
 
