@@ -81,7 +81,7 @@ class GaussianConfig(SplattingConfig):
     """Moment after which `max_scale` counts."""
     reset_interval: PositiveInt = 3_000
     """Moments from one opacity reset to the next, while the set of Gaussians grows."""
-    reset_opacity: NonNegativeFloat = 0.01
+    reset_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """No opacity is above it after a reset."""
     max_gaussians: NonNegativeInt = 0
     """No round grows the set beyond this; the largest gradients come first. 0: no limit."""

@@ -8,6 +8,7 @@ import torch
 from toy_scene import EXTENT, HEIGHT, SHORT, WIDTH, toy_scene
 
 from baselines.gaussian_splatting.method import GaussianSplatting
+from chronoscene.errors import ConfigError
 from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.model import SHAPES, logit, opacities_of
 from chronoscene.gaussians.trainer import Timeline
@@ -132,6 +133,12 @@ def test_a_reset_leaves_the_opacities_alone_otherwise():
     assert torch.equal(method.model.parameters["logit_opacities"], before.clamp_max(logit(0.01)))
     assert not method.trainer.optimizer.state()["logit_opacities.mean"].any()
     assert not torch.equal(method.model.parameters["means"], means)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1.0, 2.0])
+def test_a_reset_is_to_an_opacity_that_has_a_logit(opacity):
+    with pytest.raises(ConfigError, match="reset_opacity: expected"):
+        replace(SHORT, reset_opacity=opacity)
 
 
 def test_an_empty_step_changes_nothing_but_the_schedule_goes_on():
