@@ -10,6 +10,9 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from chronoscene.fields.grid import GridLayout
 from chronoscene.methods import check_options
 
+Cells = Annotated[int, Field(ge=1, le=1 << 20)]
+"""Cells along an edge of a level; 64 bits hold the number of all its grid points."""
+
 
 @dataclass(frozen=True)
 class FieldConfig:
@@ -28,11 +31,11 @@ class FieldConfig:
     """Levels of the hash grid."""
     log2_rows: Annotated[int, Field(ge=4, le=24)] = 17
     """Logarithm of the largest number of rows of a level."""
-    base: PositiveInt = 16
+    base: Cells = 16
     """Cells along an edge of the first level, in the contracted cube."""
-    finest: PositiveInt = 4_096
+    finest: Cells = 4_096
     """Cells along an edge of the last level; half of them are within the cube of the scene."""
-    frequencies: PositiveInt = 10
+    frequencies: Annotated[int, Field(ge=1, le=64)] = 10
     """Frequencies of each coordinate, if that is the encoding."""
     hidden: PositiveInt = 64
     """Width of hidden layers."""

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from baselines.continual_nerf.replay import Memory
-from chronoscene.errors import CheckpointError
+from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.fields.box import box_of, contract
 from chronoscene.fields.method import Drawn, FieldMethod
 from chronoscene.fields.occupancy import start_occupancy
@@ -262,6 +262,14 @@ def test_what_is_hidden_is_not_evaluated_in_renders(
     assert torch.equal(far, near)
     share = count / len(samples.lengths) - 1
     assert share == 1 if shift < 0 else share < 0.5
+
+
+@pytest.mark.parametrize("option", [{"finest": 2_200_000}, {"base": 1 << 22}, {"frequencies": 200}])
+def test_codes_beyond_what_numbers_can_hold_are_refused(option: dict[str, int]) -> None:
+    """There would be more grid points than 64 bits can number, or infinite angles."""
+    (name,) = option
+    with pytest.raises(ConfigError, match=f"{name}: expected a value less than or equal to"):
+        build_config(load_spec("nerf"), preset="fast", overrides=option)
 
 
 def test_rays_that_meet_nothing_show_the_background() -> None:
