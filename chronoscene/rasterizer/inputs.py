@@ -96,6 +96,7 @@ def _check_shapes(arrays: dict[str, Tensor], backgrounds: Tensor | None) -> None
             array.is_floating_point(), name, "floating point", array.dtype, todo="call .float()"
         )
     count, cameras = len(arrays["means"]), len(arrays["viewmats"])
+    _require(cameras > 0, "viewmats", "at least one camera", "none", todo="pass those to draw")
     shapes: dict[str, tuple[int | None, ...]] = {
         "means": (count, 3),
         "quats": (count, 4),
@@ -120,7 +121,8 @@ def check_settings(inputs: Inputs) -> None:
 def _check_size(inputs: Inputs) -> None:
     for name, size in (("width", inputs.width), ("height", inputs.height)):
         todo = "correct the argument, or render a larger image in parts"
-        _require(1 <= size <= SIZE_MAX, name, f"1 to {SIZE_MAX} pixels", size, todo)
+        whole = isinstance(size, int | np.integer) and 1 <= size <= SIZE_MAX
+        _require(whole, name, f"1 to {SIZE_MAX} whole pixels", size, todo)
 
 
 def _check_options(inputs: Inputs) -> None:
@@ -166,11 +168,20 @@ def _all_finite(data: Tensor) -> bool:
 
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> None:
-    """No camera may be mirrored, too wide or singular."""
-    focals = Ks.detach().double().cpu().numpy()[:, [0, 1], [0, 1]]
+    """No camera may have skew or mirrored intrinsics, be too wide or singular."""
+    intrinsics = Ks.detach().double().cpu().numpy()
+    focals = intrinsics[:, [0, 1], [0, 1]]
+    others = intrinsics[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]
     least = FOCAL_MIN * np.array([width, height])
     volumes = np.linalg.det(viewmats.detach().double().cpu().numpy()[:, :3, :3])
     for camera, (focal, volume) in enumerate(zip(focals, volumes, strict=True)):
+        _require(
+            not others[camera].any(),
+            f"Ks[{camera}]",
+            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+            intrinsics[camera].tolist(),
+            todo="undistort images of cameras with skew, and divide by the last number",
+        )
         _require(
             (focal > 0).all(),
             f"Ks[{camera}]",

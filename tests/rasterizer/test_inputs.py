@@ -42,11 +42,13 @@ def arguments() -> dict[str, Any]:
         ("opacities", torch.zeros(5, 1), r"opacities: expected shape \[5\], found \[5, 1\]"),
         ("colors", torch.zeros(5), r"colors: expected shape \[5, \*\], found \[5\]"),
         ("viewmats", torch.eye(4), r"viewmats: expected shape \[4, 4, 4\], found \[4, 4\]"),
+        ("viewmats", torch.zeros(0, 4, 4), r"viewmats: expected at least one camera, found none"),
         ("Ks", torch.eye(3), r"Ks: expected shape \[1, 3, 3\], found \[3, 3\]"),
         ("backgrounds", torch.zeros(3), r"backgrounds: expected shape \[1, 3\], found \[3\]"),
         ("means", torch.zeros(5, 3, dtype=torch.int64), r"means: expected floating point"),
-        ("width", 0, r"width: expected 1 to 65536 pixels, found 0"),
-        ("height", 65537, r"height: expected 1 to 65536 pixels, found 65537"),
+        ("width", 0, r"width: expected 1 to 65536 whole pixels, found 0"),
+        ("width", 12.5, r"width: expected 1 to 65536 whole pixels, found 12.5"),
+        ("height", 65537, r"height: expected 1 to 65536 whole pixels, found 65537"),
         ("near_plane", 0.0, r"expected 1e-18 <= near_plane < far_plane <= 1e\+18, found 0\.0"),
         ("near_plane", float("nan"), r"expected 1e-18 <= near_plane < far_plane .* found nan"),
         ("far_plane", float("inf"), r"expected 1e-18 <= near_plane < far_plane .* inf"),
@@ -101,6 +103,16 @@ def test_without_the_check_bad_gaussians_are_culled(
 def test_a_mirrored_intrinsic_matrix_is_refused(arguments: dict[str, Any]) -> None:
     arguments["Ks"] = arguments["Ks"] * torch.tensor([-1.0, 1.0, 1.0])
     with pytest.raises(ShapeError, match=r"Ks\[0\]: expected positive focal lengths"):
+        rasterize(**arguments)
+
+
+@pytest.mark.parametrize("place", [(0, 1), (1, 0), (2, 0), (2, 1), (2, 2)])
+def test_intrinsics_that_would_be_ignored_are_refused(
+    arguments: dict[str, Any], place: tuple[int, int]
+) -> None:
+    arguments["Ks"] = arguments["Ks"].clone()
+    arguments["Ks"][0][place] += 0.5
+    with pytest.raises(ShapeError, match=r"Ks\[0\]: expected \[\[fx, 0, cx\]"):
         rasterize(**arguments)
 
 

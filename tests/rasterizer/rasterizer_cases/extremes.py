@@ -374,7 +374,7 @@ EXTREMES = (
         "an image of 65537 x 1",
         "Error: so far from the corner float32 places centres to 0.008 pixels only.",
         lambda: _base(width=65537, height=1),
-        "width: expected 1 to 65536 pixels, found 65537",
+        "width: expected 1 to 65536 whole pixels, found 65537",
     ),
     Extreme("a focal length of 1e7", "Right: a view of 0.0002 degrees.", lambda: _focal(1e7)),
     Extreme(
