@@ -125,7 +125,7 @@ def test_opaque_gaussians_end_pixels(tools: SimpleNamespace, check_agreement: Ch
 def test_opaque_gaussians_just_outside_the_image(
     tools: SimpleNamespace, check_agreement: Check
 ) -> None:
-    """Of a block that reaches over the edge, the pixels outside let no light through."""
+    """Pixels outside the image, in a block over its edge, let no light through."""
     count = 100
     scene = tools.random_scene(count, 5, 5)
     check_agreement(
