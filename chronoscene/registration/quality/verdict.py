@@ -184,17 +184,32 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
             yield from _check("localised", _localised(found, certificate), place)
     if isinstance(pair.surfaces, SurfaceDistance):
         shift = pair.surfaces.shift
-        if shift.low > 0:
-            against = list(_check("clouds", 100 * shift.value / certificate.extent, place))
-            yield from against or _contradiction(pair, place)
+        shifted = shift.low > 0
+        against = list(
+            _check("clouds", 100 * shift.value / certificate.extent if shifted else 0.0, place)
+        )
+        yield from against or _contradiction(certificate, pair, place, shifted)
         yield from _check("open", 100 * shift.high / certificate.extent, place)
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
-def _contradiction(pair: PairFigures, place: str) -> Iterator[Objection]:
-    """Judge surfaces that are shifted by less than the limit, but against the matches."""
-    if _contradicted(pair):
-        found = "the surfaces are shifted, and contradict the matches (Hotelling, 99 %)"
+def _contradiction(
+    certificate: Certificate, pair: PairFigures, place: str, shifted: bool
+) -> Iterator[Objection]:
+    """Judge surfaces that contradict the matches, but not by a shift beyond the limit.
+
+    Patches of real surfaces are surer than they are right, and err most in their turn. So the
+    contradiction counts only where they are `shifted`, or by themselves find the periods displaced
+    beyond the limit; forward-facing captures leave their depths open, so the latter says nothing
+    there.
+    """
+    if not _contradicted(pair):
+        return
+    alone = _of_limits(certificate, pair.by_surfaces)
+    displaced = bool(alone) and alone[1].value > 1 and not certificate.facing
+    if shifted or displaced:
+        state = "are shifted" if shifted else "find the periods displaced beyond the limit"
+        found = f"the surfaces {state}, and contradict the matches (Hotelling, 99 %)"
         yield Objection("doubtful", "clouds", place, found, THRESHOLDS["clouds"].why, LOOK)
 
 

@@ -484,9 +484,13 @@ def test_shifted_surfaces_that_contradict_the_matches_are_a_doubt(tracks: str) -
     still = with_part(certificate, "surfaces", shift=Interval(0.07, 0.0, 0.2))
     still = with_pair(still, **{without: None})
     assert judge(still).level == "pass"
-    # A similarity alone is none: small patches of real surfaces are surer than they are right.
-    alone = (Interval(0.01, 0.0, 0.02), Interval(0.12, 0.1001, 0.15))
-    assert judge(with_pair(still, by_surfaces=alone)).level == "pass"
+    # A similarity alone is one if it displaces beyond the limit; patches turn by chance.
+    for turn, shift, level in ((0.2, 0.099, "pass"), (0.0, 0.101, "doubtful")):
+        alone = tuple(Interval(value, value - 0.01, value + 0.01) for value in (turn, shift))
+        similar = with_pair(still, by_surfaces=alone)
+        assert judge(similar).level == level
+        # Forward-facing captures leave the depths of surfaces open.
+        assert judge(replace(similar, facing=True)).level == "pass"
 
 
 def test_held_out_tracks_beyond_the_limit_fail_with_the_estimate_of_all_ties() -> None:
