@@ -19,6 +19,7 @@ from chronoscene.registration.reconstruct.focal import Focals, stated_focals
 from chronoscene.registration.reconstruct.mapping import Task, adjust, triangulate
 
 MIN_GAIN = 0.02  # Share by which the median reprojection error must shrink
+SAMPLE = 5_000  # Points that show at little cost whether it can shrink that far
 
 
 def with_full_lens(
@@ -39,10 +40,11 @@ def with_full_lens(
     many = [c for c in many if model.cameras[c].model_name == "SIMPLE_RADIAL"]
     if not many or task.short:
         return model
+    task.report("adjusting the lens", 0, 1)
     before = _error(model)
     free = replace(task, held=False)
     for attempt in (free, task) if task.held else (free,):
-        found = _adjusted(model, attempt, many)
+        found = _adjusted(model, attempt, many) if _may_gain(model, attempt, many) else model
         if _error(found) > (1 - MIN_GAIN) * before:
             task.remarks.append("more coefficients of the lens gain nothing")
             return model
@@ -62,24 +64,45 @@ def with_full_lens(
     return model
 
 
+def _may_gain(model: pycolmap.Reconstruction, task: Task, cameras: list[int]) -> bool:
+    """Return False if an even selection of the points gains less than half of what it must."""
+    ids = sorted(model.points3D)
+    if len(ids) < 2 * SAMPLE:
+        return True
+    sample = pycolmap.Reconstruction(model)
+    for point_id in set(ids).difference(ids[:: len(ids) // SAMPLE]):
+        sample.delete_point3D(point_id)
+    before = _error(sample)
+    _free_lens(sample, cameras)
+    adjust(sample, task)
+    return _error(sample) <= (1 - MIN_GAIN / 2) * before
+
+
 def _adjusted(
     model: pycolmap.Reconstruction, task: Task, cameras: list[int]
 ) -> pycolmap.Reconstruction:
     found = pycolmap.Reconstruction(model)
-    full = {}
-    for camera_id in cameras:
-        f, x, y, k = found.cameras[camera_id].params
-        full[camera_id] = MANY, [f, f, x, y, k, 0.0, 0.0, 0.0]
-        found.cameras[camera_id].model = getattr(pycolmap.CameraModelId, MANY)
-        found.cameras[camera_id].params = full[camera_id][1]
+    full = _free_lens(found, cameras)
     database = task.scratch / "lens.db"
     copy_with_cameras(task.database, database, full)
     task = replace(task, database=str(database))
-    task.report("adjusting the lens", 0, 1)
     adjust(found, task)
     found = triangulate(found, task, "lens")
     adjust(found, task)
     return found
+
+
+def _free_lens(
+    model: pycolmap.Reconstruction, cameras: list[int]
+) -> dict[int, tuple[str, list[float]]]:
+    """Give cameras all coefficients, 0 at first; return their model and parameters by id."""
+    full = {}
+    for camera_id in cameras:
+        f, x, y, k = model.cameras[camera_id].params
+        full[camera_id] = MANY, [f, f, x, y, k, 0.0, 0.0, 0.0]
+        model.cameras[camera_id].model = getattr(pycolmap.CameraModelId, MANY)
+        model.cameras[camera_id].params = full[camera_id][1]
+    return full
 
 
 def _error(model: pycolmap.Reconstruction) -> float:

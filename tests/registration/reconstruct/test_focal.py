@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from chronoscene.colmap.model import read_model
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.reconstruct.lens import _adjusted as full
 from chronoscene.registration.reconstruct.routes import joint
 from chronoscene.scene.geometry import camera_centre, look_at
 
@@ -93,6 +95,29 @@ def test_a_full_model_of_the_lens_gives_focal_length_and_height(
     assert focal == pytest.approx(FOCAL, rel=0.03)
     assert height == pytest.approx(HEIGHT, rel=0.03)
     assert any("all coefficients of the lens" in r for r in result["remarks"])
+
+
+@pytest.mark.parametrize(("lens", "gains"), [(LENS, True), ((-0.05, 0.0, 0.0, 0.0), False)])
+def test_part_of_the_points_shows_whether_a_full_model_gains_anything(
+    tmp_path: Path,
+    write_database: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+    lens: tuple[float, ...],
+    gains: bool,
+) -> None:
+    module = "chronoscene.registration.reconstruct.lens"
+    monkeypatch.setattr(f"{module}.MIN_PHOTOS", 12)
+    spy = Mock(side_effect=full)
+    monkeypatch.setattr(f"{module}._adjusted", spy)
+    results = []
+    for name, sample in (("all", 10**6), ("sample", 300)):
+        monkeypatch.setattr(f"{module}.SAMPLE", sample)
+        case = flight(write_database, tmp_path / name, "SIMPLE_RADIAL", lens, FOCAL)
+        remarks = joint(case | {"full_lens": True}, lambda *_: None)["remarks"]
+        results.append((remarks, found(case)))
+    assert results[0] == results[1]
+    assert any(("lens: focal" if gains else "gain nothing") in r for r in results[0][0])
+    assert spy.call_count == 1 + gains
 
 
 def test_a_wrong_focal_length_in_the_metadata_does_no_harm(make_case: Callable[..., Any]) -> None:
