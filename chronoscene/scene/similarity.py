@@ -78,37 +78,32 @@ class Sim3:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """``x -> matrix @ x + translation``: the result of a fit, which may be a reflection."""
+    """``x -> matrix @ x + translation``: the result of a fit."""
 
     matrix: Array
-    """Scale times a rotation or a reflection. [3, 3]"""
+    """Scale times a rotation. [3, 3]"""
     translation: Array
 
     @property
-    def mirrored(self) -> bool:
-        return bool(np.linalg.det(self.matrix) < 0)
-
-    @property
     def scale(self) -> float:
-        return float(np.cbrt(abs(np.linalg.det(self.matrix))))
+        return float(np.cbrt(np.linalg.det(self.matrix)))
 
     def apply(self, points: Array) -> Array:
         """Transform points. [N, 3]"""
         return points @ self.matrix.T + self.translation
 
     def to_sim3(self) -> Sim3:
-        """Convert to a `Sim3`; it must not be a reflection."""
+        """Convert to a `Sim3`."""
         scale = self.scale
         return Sim3(scale, self.matrix / scale, self.translation)
 
 
-def fit(source: Array, target: Array, *, mirror: bool = False) -> Similarity | None:
+def fit(source: Array, target: Array) -> Similarity | None:
     """Fit a similarity to corresponding points by least squares; None if they determine none.
 
     Args:
         source: At least three points, not on one line. [N, 3]
         target: Their targets. [N, 3]
-        mirror: Allow a reflection.
 
     Source: Umeyama 1991, equations 40 to 42.
     """
@@ -122,32 +117,25 @@ def fit(source: Array, target: Array, *, mirror: bool = False) -> Similarity | N
     if not d[1] > 1e-9 * d[0]:
         return None
     signs = np.ones(3)
-    if not mirror and np.linalg.det(u) * np.linalg.det(vt) < 0:
+    if np.linalg.det(u) * np.linalg.det(vt) < 0:
         signs[2] = -1
     matrix = (d * signs).sum() / variance * (u * signs) @ vt
     return Similarity(matrix, centre_target - matrix @ centre_source)
 
 
 def fit_samples(
-    source: Array,
-    target: Array,
-    samples: Iterable[Ints],
-    cost: Callable[[Similarity], float],
-    *,
-    mirror: bool = False,
+    source: Array, target: Array, samples: Iterable[Ints], cost: Callable[[Similarity], float]
 ) -> tuple[Similarity | None, float]:
     """Fit a similarity to each sample of rows; the one of least cost, and its cost."""
     best, least = None, np.inf
     for rows in samples:
-        candidate = fit(source[rows], target[rows], mirror=mirror)
+        candidate = fit(source[rows], target[rows])
         if candidate is not None and (value := cost(candidate)) < least:
             best, least = candidate, value
     return best, least
 
 
-def fit_robustly(
-    source: Array, target: Array, *, axes: int = 3, mirror: bool = False
-) -> tuple[Similarity, Array] | None:
+def fit_robustly(source: Array, target: Array, *, axes: int = 3) -> tuple[Similarity, Array] | None:
     """Fit a similarity that most points agree on; return it and the distances to the targets.
 
     The best of many triples by median distance, then least squares over the points within 2.5
@@ -157,7 +145,6 @@ def fit_robustly(
         source: [N, 3]
         target: [N, 3]
         axes: Number of target axes along which distances are measured: 2 ignores heights.
-        mirror: Allow a reflection.
 
     Source: least median of squares, Rousseeuw 1984.
     """
@@ -168,13 +155,13 @@ def fit_robustly(
     def median(candidate: Similarity) -> float:
         return float(np.median(_distances(candidate, source[judges], target[judges], axes)))
 
-    best, _ = fit_samples(source, target, triples, median, mirror=mirror)
+    best, _ = fit_samples(source, target, triples, median)
     for _ in range(3):
         if best is None:
             return None
         distance = _distances(best, source, target, axes)
         near = distance <= 2.5 * SIGMA * np.median(distance)
-        best = fit(source[near], target[near], mirror=mirror) or best
+        best = fit(source[near], target[near]) or best
     return (best, _distances(best, source, target, axes)) if best is not None else None
 
 
