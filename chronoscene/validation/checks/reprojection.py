@@ -73,8 +73,3 @@ def typical_depth(scene: RawScene) -> float:
 def outlier_limit(usual: float) -> float:
     """Median reprojection error in pixels that stands out from a usual one."""
     return max(MIN_ERROR, WORSE * usual)
-
-
-def period_limit(scene: RawScene) -> float:
-    """Median reprojection error in pixels beyond which a period stands out among the others."""
-    return outlier_limit(min(period_errors(scene).values(), default=0.0))

@@ -1,4 +1,4 @@
-"""CS512, CS513, CS515, CS516: whether points, poses and cameras fit each other."""
+"""CS512, CS513, CS515, CS516: points, poses and cameras against each other."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from chronoscene.validation import rule
 from chronoscene.validation.checks import reprojection
 from chronoscene.validation.checks.reprojection import image_errors, pose_limit
 from chronoscene.validation.folder.observations import Reprojection
-from chronoscene.validation.folder.scene_folder import RawScene, derived
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs1_poses import other_convention
 
@@ -73,24 +73,18 @@ def pose_disagrees(scene: RawScene, images: RawImages) -> Iterator[Hit]:
 )
 def period_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     """The reprojection error of a period is far above that of another period."""
-    errors = image_errors(scene)
-    for period, limit in _worse_periods(scene).items():
-        index = scene.period_ids.index(period)
-        known = np.flatnonzero((scene.image_periods == index) & ~np.isnan(errors))
-        worst = known[np.argsort(-errors[known])]
-        named = shown([images.names[i] for i in worst])
-        found = f"{reprojection.period_errors(scene)[period]:.3g} px; the worst are {named}"
-        yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
-
-
-@derived
-def _worse_periods(scene: RawScene) -> dict[int, float]:
-    """Periods that stand out, with the limit for their median error in pixels."""
-    limit, judged = reprojection.period_limit(scene), reprojection.judged_images(scene)
+    errors, judged = image_errors(scene), reprojection.judged_images(scene)
+    medians = reprojection.period_errors(scene)
+    limit = reprojection.outlier_limit(min(medians.values(), default=0.0))
     if not judged or limit > reprojection.WORSE * np.median([pose_limit(scene, i) for i in judged]):
-        return {}  # no period fits: nothing to compare with
-    errors = reprojection.period_errors(scene).items()
-    return {p: limit for p, median in errors if median > limit}
+        return  # no period fits: nothing to compare with
+    for period, median in medians.items():
+        if median > limit:
+            index = scene.period_ids.index(period)
+            known = np.flatnonzero((scene.image_periods == index) & ~np.isnan(errors))
+            worst = known[np.argsort(-errors[known])]
+            found = f"{median:.3g} px; the worst are {shown([images.names[i] for i in worst])}"
+            yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
 
 
 @rule.warning(
