@@ -155,7 +155,7 @@ def _fix(folder: Path, scenes: Sequence[Path], out: Path, options: ReadOptions) 
     for scene in scenes:
         copy = out if scene == folder else out / scene.name
         announce(f"correct {scene}")
-        repairs = fix_scene(scene, copy, options)
+        repairs = fix_scene(scene, copy)
         say(f"{copy}: {counted(len(repairs), 'correction')}")
         for repair in repairs:
             say(f"  {repair.code or 'also'}: {repair.text}")

@@ -27,31 +27,29 @@ from chronoscene.validation.repair.contents import Repair
 from chronoscene.validation.rules.cs1_cameras import rig_pose_differs
 from chronoscene.validation.rules.cs2_image_files import images_of_other_shape
 from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE, TEST_ELSEWHERE
-from chronoscene.validation.run import DETECT, ReadOptions, is_project, other_format, quiet_numbers
+from chronoscene.validation.run import ReadOptions, is_project, other_format, quiet_numbers
 
 
-def fix_scene(root: Path, out: Path, options: ReadOptions = DETECT) -> list[Repair]:
+def fix_scene(root: Path, out: Path) -> list[Repair]:
     """Write a corrected copy; the folder appears complete or not at all.
 
     Args:
-        root: The scene.
+        root: The scene, as `check_fixable` allows it.
         out: Folder that does not exist yet, or is empty, and is not inside the scene.
-        options: How to read the scene.
 
     Returns:
         The corrections.
 
     Raises:
-        ConfigError: If ``out`` is inside the scene, or the scene is of another format.
+        ConfigError: If ``out`` is inside the scene.
         SceneError: If ``out`` is in use or cannot be written.
     """
     check_outside(out, [root], option="--fix")
-    check_fixable(root, options)
     with staged_folder(out) as staged, quiet_numbers():
         return _Fix(RawScene(root), staged).run()
 
 
-def check_fixable(root: Path, options: ReadOptions = DETECT) -> None:
+def check_fixable(root: Path, options: ReadOptions) -> None:
     """Refuse a scene in another format than ours and that of a COLMAP project.
 
     Raises:

@@ -10,7 +10,7 @@ from chronoscene.convert import convert
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import neusc
-from chronoscene.validation.repair.fix import fix_scene
+from chronoscene.validation.repair.fix import check_fixable, fix_scene
 from chronoscene.validation.run import ReadOptions, find_folders, other_format, validate_scene
 
 ALONE = {"CS321", "CS706"}  # What is said of a scene without sparse/0/test.txt
@@ -308,10 +308,10 @@ def test_projects_are_corrected(project, tmp_path):
     assert not copy.count("error") and other_format(copy.path).name == "colmap-folders"
 
 
-def test_other_formats_are_not_corrected(studio, tmp_path):
+def test_other_formats_are_not_corrected(studio, project):
     with pytest.raises(ConfigError, match="found one in nerfstudio; convert it"):
-        fix_scene(studio, tmp_path / "fixed")
-    assert not (tmp_path / "fixed").exists()
+        check_fixable(studio, ReadOptions())
+    check_fixable(project.root, ReadOptions())
 
 
 def test_the_model_of_a_project_is_looked_for_once(project, monkeypatch):
