@@ -55,7 +55,6 @@ class PeriodRenderer:
         probe_box: Array,
         probe_spacing: float,
     ) -> None:
-        self.light = light
         self._sky = sky_args(light)
         self._element = tri_element
         self._ss = supersample
@@ -75,11 +74,14 @@ class PeriodRenderer:
         world_from_cam = np.linalg.inv(cam_from_world)
         per_pixel = self._ss * self._ss
         step = max(1, MAX_SAMPLES // (camera.width * per_pixel))
+        fw = 1.0 / (camera.K[0, 0] * self._ss)
         rows = []
         for row in range(0, camera.height, step):
             count = min(step, camera.height - row)
             rays = camera_rays(world_from_cam, camera.K, camera.width, row, count, self._ss)
-            rows.append(self._shade(rays, per_pixel, 1.0 / (camera.K[0, 0] * self._ss)))
+            hits = self.surfaces.cast(rays)
+            lit = self._lit(rays, hits, per_pixel)
+            rows.append(shade(rays, *hits, lit, self.tables, self._sky, self.probes, per_pixel, fw))
         return np.concatenate(rows).reshape(camera.height, camera.width, 3)
 
     def maps(self, camera: Camera, cam_from_world: Array) -> PixelMaps:
@@ -125,13 +127,16 @@ class PeriodRenderer:
         step = (high - low) / (count - 1)
         grid = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1)
         places = (low + grid * step).reshape(-1, 3)
-        directions = _sphere(PROBE_RAYS)
+        directions, albedo = _sphere(PROBE_RAYS), _mean_albedo(self.tables.styles)
         values, valid = [], []
         for start in range(0, len(places), MAX_SAMPLES // PROBE_RAYS):
             some = places[start : start + MAX_SAMPLES // PROBE_RAYS]
             rays = np.empty((len(some), PROBE_RAYS, 6), np.float32)
             rays[..., :3], rays[..., 3:] = some[:, None], directions
-            v, ok = self._probe_batch(rays.reshape(-1, 6))
+            flat = rays.reshape(-1, 6)
+            hits = self.surfaces.cast(flat)
+            lit = self._lit(flat, hits, 1)
+            v, ok = probe_values(flat, *hits, lit, self.tables, albedo, self._sky, PROBE_RAYS)
             values.append(v)
             valid.append(ok)
         shape = tuple(int(n) for n in count)
@@ -142,14 +147,6 @@ class PeriodRenderer:
             np.concatenate(valid).reshape(shape),
         )
 
-    def _probe_batch(
-        self, rays: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        hits = self.surfaces.cast(rays)
-        lit = self._lit(rays, hits, 1)
-        means = _mean_albedo(self.tables.styles)
-        return probe_values(rays, *hits, lit, self.tables, means, self._sky, PROBE_RAYS)
-
     def _lit(self, rays: NDArray[np.float32], hits: Hits, count: int) -> NDArray[np.bool_]:
         """Mask of the hits that the sun reaches. [n]"""
         towards, need = shadow_rays(
@@ -158,13 +155,6 @@ class PeriodRenderer:
         lit = np.zeros(len(need), np.bool_)
         lit[need] = ~self.surfaces.occluded(towards[need])
         return lit
-
-    def _shade(
-        self, rays: NDArray[np.float32], per_pixel: int, fw_unit: float
-    ) -> NDArray[np.uint8]:
-        hits = self.surfaces.cast(rays)
-        lit = self._lit(rays, hits, per_pixel)
-        return shade(rays, *hits, lit, self.tables, self._sky, self.probes, per_pixel, fw_unit)
 
 
 def _sphere(count: int) -> NDArray[np.float32]:
