@@ -6,12 +6,9 @@ Importing this package is cheap; `generate` imports the ray caster when it is ca
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from chronoscene.io.processes import Report
 from chronoscene.synth.settings import PRESETS, SynthSettings, preset
-
-if TYPE_CHECKING:
-    from chronoscene.synth.generation import Progress
 
 __all__ = ["PRESETS", "SynthSettings", "generate", "preset"]
 
@@ -19,7 +16,7 @@ __all__ = ["PRESETS", "SynthSettings", "generate", "preset"]
 def generate(
     out: Path | str,
     settings: SynthSettings,
-    progress: Progress | None = None,
+    report: Report = lambda what, done, total: None,
     *,
     truth: bool = True,
 ) -> None:
@@ -30,7 +27,7 @@ def generate(
     Args:
         out: Folder to create; must not exist or must be empty.
         settings: What to generate; see `preset`.
-        progress: Called as ``progress(done, total, what)`` after each unit of work.
+        report: Called after each unit of work.
         truth: False for no ground truth, which takes half as long as all photos where there are
             many periods.
 
@@ -39,4 +36,4 @@ def generate(
     """
     from chronoscene.synth.generation import run
 
-    run(Path(out), settings, progress, truth=truth)
+    run(Path(out), settings, report, truth=truth)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene.formats import chronoscene as scene_format
+from chronoscene.io.processes import Report
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.synth.city.plan import make_world
@@ -20,29 +20,22 @@ from chronoscene.synth.settings import SynthSettings
 from chronoscene.synth.sparse_points import make_points
 from chronoscene.synth.truth import save_image, write_truth
 
-Progress = Callable[[int, int, str], None]
-
 MONTHS = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
 FIRST_YEAR = 2016
 
 
-def run(
-    out: Path, settings: SynthSettings, progress: Progress | None = None, *, truth: bool = True
-) -> None:
+def run(out: Path, settings: SynthSettings, report: Report, *, truth: bool) -> None:
     """Generate a scene; see `chronoscene.synth.generate`. Either all of it appears or nothing."""
-    progress = progress or (lambda done, total, what: None)
-    progress(0, 1, "city")
+    report("city", 0, 1)
     with staged_folder(out) as staged:
         raw = staged.parent / "raw"
-        scene = _make(raw, settings, progress, out.name, truth=truth)
+        scene = _make(raw, settings, report, out.name, truth=truth)
         scene_format.write(scene, staged, image_source="link")
         if truth:
             (raw / "gt").rename(staged / "gt")
 
 
-def _make(
-    raw: Path, settings: SynthSettings, progress: Progress, name: str, *, truth: bool
-) -> Scene:
+def _make(raw: Path, settings: SynthSettings, report: Report, name: str, *, truth: bool) -> Scene:
     """Write photos and, if wanted, ground truth below ``raw`` and return the scene."""
     world = make_world(settings)
     renderers = make_renderers(settings, world)
@@ -64,18 +57,18 @@ def _make(
     def advance(what: str) -> None:
         nonlocal done
         done += 1
-        progress(done, total, what)
+        report(what, done, total)
 
     advance("city")
     for frame in scene.frames:
         image = renderers[frame.period].image(frame.camera, frame.cam_from_world)
         save_image(scene.image_path(frame), image)
         advance("photos")
-    progress(done, total, "points")
+    report("points", done, total)
     points = make_points(settings, scene, renderers)
     advance("points")
     if truth:
-        progress(done, total, "ground truth")
+        report("ground truth", done, total)
         write_truth(raw / "gt", scene, world, renderers, advance)
     return replace(scene, points=points)
 

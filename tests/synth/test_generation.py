@@ -133,7 +133,7 @@ def test_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     class StopError(Exception):
         pass
 
-    def stop(done: int, total: int, what: str) -> None:
+    def stop(what: str, done: int, total: int) -> None:
         if what == "photos":
             raise StopError
 
@@ -144,12 +144,12 @@ def test_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_progress_counts_to_the_end(tmp_path: Path) -> None:
-    seen: list[tuple[int, int, str]] = []
+    seen: list[tuple[str, int, int]] = []
     settings = preset("tiny", **SMALL, kind="street", periods=1)
     generate(tmp_path / "scene", settings, lambda *x: seen.append(x))
-    done = [count for count, _, _ in seen]
+    done = [count for _, count, _ in seen]
     # A step that takes long is named when it begins, with the count as it was.
-    assert done == sorted(done) and set(done) == set(range(seen[-1][1] + 1))
+    assert done == sorted(done) and set(done) == set(range(seen[-1][2] + 1))
 
 
 @pytest.mark.parametrize(

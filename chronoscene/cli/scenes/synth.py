@@ -44,7 +44,7 @@ def command(out: Path, name: str, size: str | None, **changes: Any) -> None:
         given["width"], given["height"] = parse_size(size)
     settings = preset(name, **given)
     with progress_bar() as bar:
-        generate(out, settings, lambda done, total, what: bar(what, done, total))
+        generate(out, settings, bar)
     say(f"{out}: {counted(settings.periods, 'period')}, seed {settings.seed}")
 
 
