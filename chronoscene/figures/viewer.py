@@ -19,34 +19,28 @@ from chronoscene.io.staging import write_text_atomic
 from chronoscene.scene import Scene
 
 MAX_POINTS = 300_000
-"""In a page, so that it opens at once and turns smoothly. The page says how many there are."""
+"""In a page, so that it opens at once and turns smoothly: of more, a random choice, the same for
+equal scenes. The page says how many there are."""
 ELEVATION = np.deg2rad(35.0)  # Of the first view above the plane of the scene
 
 
-def write_page(scene: Scene, path: Path, *, max_points: int = MAX_POINTS) -> None:
-    """Write the page of a scene.
-
-    Args:
-        scene: The scene.
-        path: The HTML file.
-        max_points: A random choice of so many points is in it if there are more; the same one
-            for equal scenes.
-    """
-    write_text_atomic(path, page_of(cloud_of(scene), scene.points.rgb, max_points=max_points))
+def write_page(scene: Scene, path: Path) -> None:
+    """Write the page of a scene, an HTML file."""
+    write_text_atomic(path, page_of(cloud_of(scene), scene.points.rgb))
 
 
-def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, max_points: int = MAX_POINTS) -> str:
-    """Make the page; see `write_page`. ``rgb``: colours of the points. [P, 3]"""
-    data = json.dumps(_page_data(cloud, rgb, max_points), ensure_ascii=False)
+def page_of(cloud: Cloud, rgb: NDArray[np.uint8]) -> str:
+    """Make the page of points with colours ``rgb``. [P, 3]"""
+    data = json.dumps(_page_data(cloud, rgb), ensure_ascii=False)
     # No text can end the script: JSON has "<" inside of strings only.
     page = render_page("viewer/page", title=cloud.name, data=Markup(data.replace("<", "\\u003c")))
     return page + "\n"
 
 
-def _page_data(cloud: Cloud, rgb: NDArray[np.uint8], max_points: int) -> dict[str, Any]:
+def _page_data(cloud: Cloud, rgb: NDArray[np.uint8]) -> dict[str, Any]:
     """Collect the data of the script. Coordinates are relative to the middle of the scene."""
     good = np.flatnonzero((cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1))
-    shown = np.random.default_rng(0).permutation(good)[:max_points]
+    shown = np.random.default_rng(0).permutation(good)[:MAX_POINTS]
     # By period, in random order within: any first part of a period stands for all of it.
     shown = shown[np.argsort(cloud.period[shown], kind="stable")]
     box = shown_box(cloud, cameras=False)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
+from chronoscene.figures import viewer
 from chronoscene.figures.cloud import Cloud
 from chronoscene.figures.viewer import home_view, page_of, write_page
 from chronoscene.formats import read_scene
@@ -68,13 +69,14 @@ def test_all_points_are_there_by_period(cloud):
         np.testing.assert_array_equal(pixels[order], colors(cloud)[span][wanted])
 
 
-def test_many_points_are_thinned_evenly_and_equally(cloud):
-    page = page_of(cloud, colors(cloud), max_points=200)
+def test_many_points_are_thinned_evenly_and_equally(cloud, monkeypatch):
+    monkeypatch.setattr(viewer, "MAX_POINTS", 200)
+    page = page_of(cloud, colors(cloud))
     data = data_of(page)
     shown = [p["shown"] for p in data["periods"]]
     assert sum(shown) == 200 and shown[0] == pytest.approx(125, abs=25)
     assert [p["points"] for p in data["periods"]] == [500, 300, 0]
-    assert page == page_of(cloud, colors(cloud), max_points=200)
+    assert page == page_of(cloud, colors(cloud))
 
 
 class Tags(HTMLParser):
@@ -204,9 +206,10 @@ def browse(page: Path, folder: Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
 
 
-def test_in_a_browser(cloud, tmp_path):
+def test_in_a_browser(cloud, tmp_path, monkeypatch):
+    monkeypatch.setattr(viewer, "MAX_POINTS", 700)
     nasty = replace(cloud, labels=("0", NASTY, "2"))
-    page = page_of(nasty, colors(cloud), max_points=700)
+    page = page_of(nasty, colors(cloud))
     (tmp_path / "page.html").write_text(page.replace("</body>", SCRIPT + "</body>"), "utf-8")
     found = re.search('data-report="(.*?)"', browse(tmp_path / "page.html", tmp_path))
     assert found is not None
