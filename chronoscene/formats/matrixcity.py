@@ -85,6 +85,17 @@ def matches(path: Path) -> bool:
     )
 
 
+def is_raw(file: Path) -> bool:
+    """Return True if a file with poses is a raw one, by its first bytes."""
+    try:
+        if not file.is_file():  # a pipe would never end
+            return False
+        with file.open("rb") as opened:
+            return RAW_KEY.encode() in opened.read(65536)
+    except OSError:
+        return False
+
+
 def read(path: Path, *, period_by: str | None = None) -> Scene:
     """Read a scene."""
     path = Path(path)
@@ -145,7 +156,7 @@ def _walk(path: Path) -> Iterator[tuple[list[PoseFile], str | None]]:
     while waiting and visited < MAX_FOLDERS:
         folder, visited = waiting.pop(), visited + 1
         here = path / folder
-        if transforms.head_has(here / RAW, RAW_KEY):
+        if is_raw(here / RAW):
             yield [PoseFile(folder, RAW)], None
             continue
         folders, images = scan(here)

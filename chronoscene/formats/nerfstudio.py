@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from chronoscene.colmap.model import PosedImage
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.chronoscene import MAX_COORDINATE, MAX_PERIODS, check_name
-from chronoscene.formats.matrixcity import RAW_KEY
+from chronoscene.formats.matrixcity import is_raw
 from chronoscene.formats.shared import grouping, transforms
 from chronoscene.formats.shared.json_values import (
     parse_periods,
@@ -71,7 +71,7 @@ def matches(path: Path) -> bool:
     place = path / FILE
     if (path / "sparse/split.txt").exists() or not place.is_file():
         return False
-    return not transforms.head_has(place, RAW_KEY)
+    return not is_raw(place)
 
 
 @dataclass(frozen=True, slots=True)

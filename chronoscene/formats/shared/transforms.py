@@ -25,6 +25,7 @@ from chronoscene.images.decoding import image_size
 from chronoscene.io.documents import json_error, number
 from chronoscene.scene import Camera, Frame, Points, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS, MAX_SIDE
+from chronoscene.scene.geometry import pose_from_rotation_translation
 from chronoscene.scene.splits import IMAGE_SUFFIXES, split_of
 
 EXTENSIONS = (".png", *(s for s in IMAGE_SUFFIXES if s != ".png"), *map(str.upper, IMAGE_SUFFIXES))
@@ -55,17 +56,6 @@ def read_frames(place: Path, data: Mapping[str, Any]) -> list[dict[str, Any]]:
 def shared_keys(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a file that hold for all frames."""
     return {key: value for key, value in data.items() if key != "frames"}
-
-
-def head_has(path: Path, text: str) -> bool:
-    """Return True if the first bytes of a file contain a text."""
-    try:
-        if not path.is_file():  # a pipe would never end
-            return False
-        with path.open("rb") as file:
-            return text.encode() in file.read(65536)
-    except OSError:
-        return False
 
 
 def file_name(place: object, folder: str, file_path: object) -> str:
@@ -144,19 +134,14 @@ def nearest_rotation(place: object, block: NDArray[np.float64]) -> NDArray[np.fl
 def pose_from_opengl(place: object, world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """``cam_from_world`` with OpenCV axes of a camera-to-world matrix with OpenGL axes. [4, 4]"""
     rotation = nearest_rotation(place, world_from_cam[:3, :3]) * [1.0, -1.0, -1.0]
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ world_from_cam[:3, 3]
-    return pose
+    return pose_from_rotation_translation(rotation.T, -rotation.T @ world_from_cam[:3, 3])
 
 
 def opengl_from_pose(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse of `pose_from_opengl`. [4, 4]"""
-    rotation = cam_from_world[:3, :3]
-    world_from_cam = np.eye(4)
-    world_from_cam[:3, :3] = rotation.T * [1.0, -1.0, -1.0]
-    world_from_cam[:3, 3] = -rotation.T @ cam_from_world[:3, 3]
-    return world_from_cam
+    rotation = cam_from_world[:3, :3].T
+    centre = -rotation @ cam_from_world[:3, 3]
+    return pose_from_rotation_translation(rotation * [1.0, -1.0, -1.0], centre)
 
 
 def make_scene(
