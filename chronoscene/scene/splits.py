@@ -26,7 +26,6 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Extensions that are removed when names are compared without them."""
 
 ProblemKind = Literal[
-    "encoding",  # not text
     "fields",  # a line without two fields
     "period",  # a period id that is not a number 0, 1, ...
     "ambiguous",  # a name that matches several images
@@ -39,7 +38,7 @@ ProblemKind = Literal[
 ]
 
 FATAL: frozenset[ProblemKind] = frozenset(
-    {"encoding", "fields", "period", "ambiguous", "contradiction", "missing", "ids", "empty"}
+    {"fields", "period", "ambiguous", "contradiction", "missing", "ids", "empty"}
 )
 """Kinds that make a scene unreadable; the others are only reported."""
 
