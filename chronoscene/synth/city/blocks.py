@@ -14,10 +14,8 @@ from chronoscene.synth.city.buildings import Building, finished, foundation, fra
 from chronoscene.synth.city.ground import SLAB, Rect, floor
 from chronoscene.synth.city.placing import Block
 from chronoscene.synth.city.world import renewal_stages, site_stages, visits
-from chronoscene.synth.render.mesh import Mesh
+from chronoscene.synth.render.mesh import Mesh, X
 from chronoscene.synth.render.noise import rng_for
-
-X = np.array([1.0, 0.0, 0.0])
 
 
 def square(block: Block) -> None:

@@ -12,10 +12,8 @@ from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.facades import Front, Wall
 from chronoscene.synth.city.ground import SLAB, Rect
 from chronoscene.synth.city.roofs import add_roof
-from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, X, Y, Z, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
-
-X, Y, Z = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,8 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.render.mesh import MeshBuilder, srgb
+from chronoscene.synth.render.mesh import MeshBuilder, Z, srgb
 from chronoscene.synth.render.textures import DOOR, SIGN
-
-Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)

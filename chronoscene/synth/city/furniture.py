@@ -9,12 +9,11 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.vegetation import trunk
-from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, Z, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import CORRUGATED, PAINT, SIGN, WATER
 
 Triple = tuple[float, float, float]
-Z = np.array([0.0, 0.0, 1.0])
 
 
 class Placed(MeshBuilder):

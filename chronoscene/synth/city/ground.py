@@ -8,11 +8,10 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, X, Y, Z, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import PAVING
 
-X, Y, Z = np.eye(3)
 SLAB = 0.15  # Height of pavements above the road
 
 PATTERNS = {

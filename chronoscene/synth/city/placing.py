@@ -17,10 +17,9 @@ from chronoscene.synth.city.buildings import Building, finished
 from chronoscene.synth.city.ground import SLAB, Rect, floor, pavement
 from chronoscene.synth.city.vegetation import hedge, tree
 from chronoscene.synth.city.world import World, looks, tree_heights
-from chronoscene.synth.render.mesh import Mesh, MeshBuilder
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, X, Y
 from chronoscene.synth.render.noise import key_number, rng_for
 
-X, Y, Z = np.eye(3)
 PARKING = 2.0  # Width of the parking lane at each side of a road, metres
 RING = 3.0  # Width of pavements, metres
 

@@ -17,12 +17,11 @@ from chronoscene.synth.city.placing import PARKING, RING, Block, curb_side
 from chronoscene.synth.city.vegetation import tree
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.light import make_lights
-from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, X, Y, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import FIELDS
 from chronoscene.synth.settings import SynthSettings
 
-X, Y, Z = np.eye(3)
 ROAD = 9.6  # Width of roads with parked cars on both sides, metres
 FAR = 900.0  # Half the extent of the countryside, metres
 REBUILT = ("houses", "slabs", "tower", "park")  # Roles of a block after it is torn down and rebuilt

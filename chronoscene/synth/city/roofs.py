@@ -8,11 +8,8 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.render.mesh import MeshBuilder, srgb
+from chronoscene.synth.render.mesh import MeshBuilder, X, Y, Z, srgb
 from chronoscene.synth.render.textures import SOLAR
-
-X, Y, Z = np.eye(3)
-
 
 EAVE = 0.45  # How far pitched roofs reach beyond the walls
 

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.render.mesh import Mesh, MeshBuilder, cross, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, Z, cross, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
-
-Z = np.array([0.0, 0.0, 1.0])
 
 
 @cache

@@ -22,6 +22,9 @@ Color = tuple[float, float, float]
 TextureFrame = tuple[ArrayLike, ArrayLike, ArrayLike]
 """Origin and two unit axes."""
 
+X, Y, Z = np.eye(3)
+"""Directions of the axes of the world."""
+
 STYLE_WIDTH = 24
 """Style row: kind, three colours (1..9), numbers (10..19), reflectance at 0 degrees (20), sharpness
 of reflection (21), translucency (22), unused (23)."""
