@@ -97,9 +97,6 @@ COMMANDS = {
 }
 """Command name to ``module:attribute``."""
 
-SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
-"""Settings of all commands."""
-
 INTERRUPTED = 130  # Exit status after Ctrl-C, as in a shell
 
 USAGE_ERROR = 2  # Exit status for wrong usage and for input that cannot be read at all

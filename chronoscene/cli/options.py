@@ -172,15 +172,14 @@ _TRAINING = {
 }
 
 
-def training_options(command: Any) -> Any:
-    """Add the options that ``bench`` and ``study`` share."""
-    return add_options(*_TRAINING)(command)
-
-
 def add_options(*names: str) -> Callable[[Any], Any]:
     """Add some of the options of trainings, by the names of their arguments."""
     options = [_TRAINING[name] for name in reversed(names)]
     return lambda command: reduce(lambda found, option: option(found), options, command)
+
+
+training_options = add_options(*_TRAINING)
+"""Add the options that ``bench`` and ``study`` share."""
 
 
 def parse_assignments(assignments: tuple[str, ...], option: str = "--set") -> dict[str, str]:
