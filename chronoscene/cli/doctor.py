@@ -79,12 +79,12 @@ def command() -> None:
     heads = [(head, "") for head in ("part", "state", "found")]
     rows = [(d.what, d.state, d.found) for d in diagnoses]
     table = Table(heads, rows, labels=len(heads), title="What works on this machine")
-    emit(plain_text(table) + "\n", None)
+    emit(plain_text(table) + "\n")
     for diagnosis in diagnoses:
         if diagnosis.todo:
-            emit(f"{diagnosis.what}: {diagnosis.todo}\n", None)
+            emit(f"{diagnosis.what}: {diagnosis.todo}\n")
     if any(diagnosis.state == "needed" for diagnosis in diagnoses):
-        emit("No method can be trained here; commands on datasets may work.\n", None)
+        emit("No method can be trained here; commands on datasets may work.\n")
         click.get_current_context().exit(CANNOT_RUN)
 
 

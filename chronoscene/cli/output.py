@@ -28,7 +28,7 @@ OUT_FILE = click.option(
 )
 
 
-def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
+def emit(text: str, out: Path | None = None, *, option: str = "--out") -> None:
     """Print a text, or write it to a file without colours.
 
     Characters that the terminal lacks, or that could disturb it, are printed as escape sequences.
@@ -57,7 +57,7 @@ def say(line: str, **style: Any) -> None:
     click.secho(printable(line), err=True, reset=bool(style), **style)
 
 
-def terminal_width(out: Path | None) -> int | None:
+def terminal_width(out: Path | None = None) -> int | None:
     """Return the width of the terminal in characters; None if the text does not go to one."""
     return get_terminal_size().columns if out is None and sys.stdout.isatty() else None
 

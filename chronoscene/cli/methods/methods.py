@@ -44,7 +44,7 @@ def command(name: str | None, runs: Path, everything: bool) -> None:
         list_methods()
         return
     look_here_for([name])
-    emit("\n".join(describe(load_spec(name), runs, everything=everything)) + "\n", None)
+    emit("\n".join(describe(load_spec(name), runs, everything=everything)) + "\n")
 
 
 def list_methods() -> None:

@@ -66,9 +66,9 @@ def score(
         if outcome.error is not None:
             say(f"{name}: error: {outcome.error}", fg="red")
             continue
-        emit(f"{name}: {'; '.join(outcome.changes) or 'unchanged'}\n", None)
+        emit(f"{name}: {'; '.join(outcome.changes) or 'unchanged'}\n")
         for metric in outcome.kept:
-            emit(f"{name}: {metric} kept from an earlier scoring\n", None)
+            emit(f"{name}: {metric} kept from an earlier scoring\n")
     for reason in dict.fromkeys(scorers.skipped.values()):
         names = ", ".join(name for name, why in scorers.skipped.items() if why == reason)
         click.echo(f"{names} not computed: {reason}")
@@ -84,13 +84,13 @@ def print_runs(out: Path, new: Collection[Path] | None = None) -> None:
         new: Folders of runs; figures are drawn of the scenes of these. None for all of them.
     """
     records, failures = read_runs([out])
-    text = format_runs(records, failures, "table", width=terminal_width(None))
-    emit(text + "\n", None)
+    text = format_runs(records, failures, "table", width=terminal_width())
+    emit(text + "\n")
     places = None if new is None else {path.resolve() for path in new}
     scenes = {r.scene for r in records if places is None or r.folder.resolve() in places}
     drawn = [run for run in records if run.scene in scenes]
     figures = [*draw_figures(out, drawn), *draw_stages(out, drawn), *draw_sharing(out, records)]
-    emit("".join(f"{path}\n" for path in (out / RESULTS_FILE, out / ROWS_FILE, *figures)), None)
+    emit("".join(f"{path}\n" for path in (out / RESULTS_FILE, out / ROWS_FILE, *figures)))
 
 
 @click.command("table")

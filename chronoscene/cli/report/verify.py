@@ -42,7 +42,7 @@ def command(folders: tuple[Path, ...], entries: Path | None, lpips_weights: Path
         ]
     if entries is not None:
         found += verify_entries(entries, found)
-    emit(boxed_text(_table(found), width=terminal_width(None)) + _findings(found), None)
+    emit(boxed_text(_table(found), width=terminal_width()) + _findings(found))
     if any(run.verdict in ("differs", "incomplete") for run in found):
         click.get_current_context().exit(NOT_VERIFIED)
 

@@ -77,14 +77,13 @@ def command(
         panels = [_panel(made, run.record.period_labels) for made, _ in maps]
         draw_changes(cloud_of(found), panels, staged / "changes.png")
     table = changes_table(maps, run.record.period_labels, run.record.label)
-    emit(boxed_text(table, width=terminal_width(None)), None)
+    emit(boxed_text(table, width=terminal_width()))
     if (sharing := run.record.sharing) is not None:
         unit, count = run.record.primitive, sum(sharing.blocks)
         emit(
             f"the model has one block of features for all periods in "
             f"{100 * sharing.invariant_share:.1f} % of its {count:,} {unit}, and "
-            f"{sharing.mean_blocks:.2f} of {len(sharing.blocks)} on average\n",
-            None,
+            f"{sharing.mean_blocks:.2f} of {len(sharing.blocks)} on average\n"
         )
     report_written(out)
     if not any(scores for _, scores in maps):

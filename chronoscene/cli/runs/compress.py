@@ -58,5 +58,5 @@ def command(
         for name, old in before.aggregates.get("macro", {}).items()
         if name in after.aggregates["macro"]
     ]
-    emit("\n".join(lines) + "\n", None)
+    emit("\n".join(lines) + "\n")
     report_written(out)

@@ -98,7 +98,7 @@ def _make(
     made = make_file(run, scene, period, prepared, kind)
     size = f"{len(made.data) / 1e6:.2f} MB"
     lines = [f"{len(prepared.cloud):,} Gaussians of period {name}, {size}", *made.comments[1:]]
-    emit("\n".join(lines) + "\n", None)
+    emit("\n".join(lines) + "\n")
     return made.data
 
 

@@ -55,7 +55,7 @@ def command(
         summary = write_page(
             runs, out, trained_on, periods, max_bytes=1e6 * max_megabytes, report=report
         )
-    emit(_text(summary), None)
+    emit(_text(summary))
     report_written(summary.path)
 
 

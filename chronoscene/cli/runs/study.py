@@ -46,8 +46,8 @@ def command(name: str, seeds: int, out: Path, **options: Any) -> None:
     settings = settings_from(methods=(), seeds=tuple(range(seeds)), out=out, **options)
     outcome, finished = run_study(study, settings, say)
     if outcome.finished:
-        texts = study_texts(study, finished, outcome.failures, width=terminal_width(None))
-        emit(texts["table"], None)
+        texts = study_texts(study, finished, outcome.failures, width=terminal_width())
+        emit(texts["table"])
         for style, ending in ENDINGS.items():
             emit(texts[style], out / f"study-{file.stem}.{ending}")
     else:

@@ -93,10 +93,10 @@ def _print(summary: Mapping[str, Any]) -> None:
         names = ("periods", "polygon", "area, m²", "fill, m³", "cut, m³", "net, m³")
         title = "Volumes with their 95 % intervals"
         table = Table([(name, "") for name in names], rows, labels=2, title=title)
-        emit(boxed_text(table, width=terminal_width(None)), None)
+        emit(boxed_text(table, width=terminal_width()))
     for period in summary["periods"]:
-        emit(f"period {period['label']}: {period['points']:,} points\n", None)
+        emit(f"period {period['label']}: {period['points']:,} points\n")
     coordinates = summary["coordinates"]
-    emit(f"coordinates: {coordinates['note'] or coordinates['crs']}\n", None)
+    emit(f"coordinates: {coordinates['note'] or coordinates['crs']}\n")
     if "note" in summary:
         say(f"note: {summary['note']}", fg="yellow")

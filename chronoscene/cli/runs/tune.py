@@ -54,5 +54,5 @@ def command(
         **options,
     )
     results = tune(settings, trials, say)
-    emit(boxed_text(trials_table(results), width=terminal_width(None)), None)
+    emit(boxed_text(trials_table(results), width=terminal_width()))
     report_written(out / PRESET_FILE, out / TRIALS_FILE)

@@ -71,7 +71,7 @@ def command(
     lines = [f"{out}: {target} from {scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")
-    emit("\n".join(lines) + "\n", None)
+    emit("\n".join(lines) + "\n")
     for warning in done.warnings:
         show_note(warning)
 

@@ -37,7 +37,7 @@ def command(name: str | None, scenes: tuple[str, ...], out: Path | None) -> None
     """
     if name is None:
         refuse_options(["out"], "without NAME")
-        emit(plain_text(_table()), None)
+        emit(plain_text(_table()))
     elif name == WEIGHTS:
         _download_weights(scenes, out)
     elif DATASETS[name].repo:
@@ -45,8 +45,8 @@ def command(name: str | None, scenes: tuple[str, ...], out: Path | None) -> None
     else:
         dataset = DATASETS[name]
         refuse_options(["scenes", "out"], f"with {name}, which only people can download")
-        emit(f"{dataset.title} is on {dataset.host}. By hand: {dataset.by_hand}\n", None)
-        emit(_after(dataset, Path(name)), None)
+        emit(f"{dataset.title} is on {dataset.host}. By hand: {dataset.by_hand}\n")
+        emit(_after(dataset, Path(name)))
         click.get_current_context().exit(BY_HAND)
 
 
@@ -68,7 +68,7 @@ def _download_dataset(dataset: Dataset, scenes: tuple[str, ...], out: Path) -> N
     except DownloadError:
         click.echo(f"by hand: {dataset.by_hand}", err=True)
         raise
-    emit(_after(dataset, out), None)
+    emit(_after(dataset, out))
 
 
 def _after(dataset: Dataset, folder: Path) -> str:
@@ -91,6 +91,6 @@ def _download_weights(scenes: tuple[str, ...], out: Path | None) -> None:
         urls = " and ".join(file.url for file in LPIPS_WEIGHTS)
         click.echo(f"by hand: save {urls} in a folder and set {ENVIRONMENT} to it", err=True)
         raise
-    emit(f"LPIPS weights are in {folder}\n", None)
+    emit(f"LPIPS weights are in {folder}\n")
     if out is not None:
-        emit(f"next: give {out} as --lpips-weights, or set {ENVIRONMENT} to it\n", None)
+        emit(f"next: give {out} as --lpips-weights, or set {ENVIRONMENT} to it\n")

@@ -81,7 +81,7 @@ def command(
     done = replace(  # with what was left out when the scene was read
         done, images_dropped=done.images_dropped + images, points_unseen=done.points_unseen + points
     )
-    emit(report(done), None)
+    emit(report(done))
     for note in (*detected.notes, *remarks_on(scene), *obstacles(done.scene), *_poor(done.scene)):
         show_note(note)
 

@@ -76,4 +76,4 @@ def command(
             found, points=points, model=model, max_size=max_size, title=page.stem, report=report
         )
     write_text_atomic(page, text)
-    emit(f"{page}: {len(found)} photos, {len(text) / 1e6:.1f} MB; open it in a browser\n", None)
+    emit(f"{page}: {len(found)} photos, {len(text) / 1e6:.1f} MB; open it in a browser\n")

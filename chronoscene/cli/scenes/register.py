@@ -176,7 +176,7 @@ def command(
             say(f"note: {note}")
         raise
     text = summary(registered, out, options.crs) + "".join(i.summary for i in inspections)
-    emit(text + "".join(f"note: {note}\n" for note in found.notes), None)
+    emit(text + "".join(f"note: {note}\n" for note in found.notes))
     if any(i.failed for i in inspections):
         context.exit(FAILED)
 

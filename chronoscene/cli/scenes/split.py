@@ -100,7 +100,7 @@ def command(
         _write(split, scene_out / our_format.TEST, "--scene-out")
     if out is not None:
         _write(split, out, "OUT")
-    emit(report(split), None)
+    emit(report(split))
     for note in remarks_on(scene) if scene_out is not None else ():
         show_note(note)
 

@@ -63,7 +63,7 @@ def command(
         for note in getattr(error, "__notes__", ()):
             say(f"note: {note}")
         raise
-    emit(summary(done, out), None)
+    emit(summary(done, out))
     for note in (*detected.notes, *remarks_on(scene), *obstacles(done.scene)):
         show_note(note)
 

@@ -62,7 +62,7 @@ def command(
             image_source=LINKS[link],
             progress=partial(bar, "images"),
         )
-    emit(report(done), None)
+    emit(report(done))
     for note in remarks_on(scene):
         show_note(note)
 

@@ -34,7 +34,7 @@ def _explain(context: click.Context, option: click.Parameter, value: str | None)
     """Print the descriptions of some rules, and end."""
     if value is not None:
         rules = choose_rules(_codes([value]), place="--explain")
-        emit("\n".join(map(describe_rule, rules)), None)
+        emit("\n".join(map(describe_rule, rules)))
         context.exit(0)
 
 
