@@ -69,6 +69,17 @@ def report_written(*places: Path) -> None:
 
 
 @contextmanager
+def showing_notes() -> Iterator[None]:
+    """Print the notes of an error that ends the block, before the error itself is printed."""
+    try:
+        yield
+    except BaseException as error:
+        for note in getattr(error, "__notes__", ()):
+            say(f"note: {note}")
+        raise
+
+
+@contextmanager
 def writing_to(
     option: str, place: Path, *, expected: str = "a place that can be written to"
 ) -> Iterator[None]:

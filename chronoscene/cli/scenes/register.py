@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, refuse_options
-from chronoscene.cli.output import check_place, emit, say
+from chronoscene.cli.output import check_place, emit, showing_notes
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
@@ -160,21 +160,16 @@ def command(
         _check_not_around(place, kept, option)
         check_place(option, place)
     inspections: list[Inspection] = []
-    try:
-        with progress_bar(f"read {captures}") as report:
-            found = read_captures(captures, table=table)
-            registered = run(
-                found,
-                out,
-                options,
-                into=None if scene is None else read_scene(scene),
-                report=report,
-                inspected=inspections.append,
-            )
-    except BaseException as error:
-        for note in getattr(error, "__notes__", ()):
-            say(f"note: {note}")
-        raise
+    with showing_notes(), progress_bar(f"read {captures}") as report:
+        found = read_captures(captures, table=table)
+        registered = run(
+            found,
+            out,
+            options,
+            into=None if scene is None else read_scene(scene),
+            report=report,
+            inspected=inspections.append,
+        )
     text = summary(registered, out, options.crs) + "".join(i.summary for i in inspections)
     emit(text + "".join(f"note: {note}\n" for note in found.notes))
     if any(i.failed for i in inspections):

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import LINK, PATH, reading_options
-from chronoscene.cli.output import check_place, emit, say
+from chronoscene.cli.output import check_place, emit, showing_notes
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, show_note
 from chronoscene.convert import obstacles, remarks_on
@@ -44,25 +44,20 @@ def command(
     """
     check_outside(out, [source])
     check_place("OUT", out)
-    try:
-        with progress_bar(f"read {source}") as report:
-            detected = detect(source, format=dataset_format, period_by=period_by)
-            scene = detected.read()
-            place = our_format.MODEL if detected.name == our_format.NAME else None
-            if detected.model is not None and detected.is_by_names:
-                place = detected.model[0]
-            done = triangulate(
-                scene,
-                out,
-                threads=threads,
-                image_source=LINKS[link],
-                model=None if place is None else source / place,
-                report=report,
-            )
-    except BaseException as error:
-        for note in getattr(error, "__notes__", ()):
-            say(f"note: {note}")
-        raise
+    with showing_notes(), progress_bar(f"read {source}") as report:
+        detected = detect(source, format=dataset_format, period_by=period_by)
+        scene = detected.read()
+        place = our_format.MODEL if detected.name == our_format.NAME else None
+        if detected.model is not None and detected.is_by_names:
+            place = detected.model[0]
+        done = triangulate(
+            scene,
+            out,
+            threads=threads,
+            image_source=LINKS[link],
+            model=None if place is None else source / place,
+            report=report,
+        )
     emit(summary(done, out))
     for note in (*detected.notes, *remarks_on(scene), *obstacles(done.scene)):
         show_note(note)
