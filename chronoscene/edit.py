@@ -237,9 +237,7 @@ def _chosen_periods(scene: Scene, texts: Iterable[str], option: str) -> set[int]
         found = _find_periods(scene, text)
         if not found:
             labels = [p.label for p in scene.periods]
-            listed = ", ".join(
-                label if label == str(i) else f"{i} ({label})" for i, label in enumerate(labels)
-            )
+            listed = ", ".join(p.title for p in scene.periods)
             todo = nearest(text, labels, otherwise="choose one of them")
             raise ConfigError(option, expected=f"a period: {listed}", found=repr(text), todo=todo)
         chosen |= found

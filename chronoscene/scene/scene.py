@@ -108,6 +108,11 @@ class Period:
     date: str | None = None
     """ISO 8601 date, if known."""
 
+    @property
+    def title(self) -> str:
+        """Id, and label in parentheses where it is more than the id."""
+        return self.label if self.label == str(self.id) else f"{self.id} ({self.label})"
+
 
 @dataclass(frozen=True, slots=True)
 class WorldFrame:

@@ -130,7 +130,7 @@ def report(done: Edited) -> str:
 def _poor(scene: Scene) -> list[str]:
     """List the periods that have no training image."""
     return [
-        f"period {p.id} ({p.label}) has no training images"
+        f"period {p.title} has no training images"
         for p in scene.periods
         if not scene.select(split="train", period=p.id)
     ]

@@ -7,6 +7,7 @@ from pathlib import Path
 from chronoscene.cli.output import say
 from chronoscene.formats import detect
 from chronoscene.images.store import ImageSource
+from chronoscene.io.wording import counted
 from chronoscene.scene import Scene
 
 LINKS: dict[str | None, ImageSource] = {None: "copy", "hard": "link", "sym": "symlink"}
@@ -35,13 +36,11 @@ def describe(scene: Scene) -> str:
         (len(scene.points), "point"),
         (scene.num_periods, "period"),
     )
-    return ", ".join(f"{n} {what}{'s' * (n != 1)}" for n, what in counts)
+    return ", ".join(counted(number, noun) for number, noun in counts)
 
 
 def describe_period(scene: Scene, period: int) -> str:
     """Label and counts of a period on one line."""
     train = len(scene.select(split="train", period=period))
     test = len(scene.select(split="test", period=period))
-    label = scene.periods[period].label
-    name = f"period {period}" + (f" ({label})" if label != str(period) else "")
-    return f"{name}: {train} train, {test} test"
+    return f"period {scene.periods[period].title}: {train} train, {test} test"

@@ -69,7 +69,7 @@ def summary(done: Triangulated, out: Path) -> str:
     points = scene.points
     seen = (scene.count_views() > 0).sum(axis=0)
     lines = [f"{out}: {describe(scene)}"]
-    lines += [f"  period {p.id} ({p.label}): sees {seen[p.id]} points" for p in scene.periods]
+    lines += [f"  period {p.title}: sees {seen[p.id]} points" for p in scene.periods]
     lines.append(
         f"{done.agreeing} of {done.matches} matches in {done.pairs} pairs agree with the poses"
     )

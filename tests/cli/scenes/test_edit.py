@@ -29,6 +29,12 @@ def test_says_what_is_left(make_scene_folder, tmp_path):
     assert (tmp_path / "out/images" / frame.name).samefile(folder / "images" / frame.name)
 
 
+def test_labels_that_are_numbers_stand_once(make_scene_folder, tmp_path):
+    folder = make_scene_folder({f"{i}.png": i // 2 for i in range(4)}, tests=["0.png", "1.png"])
+    result = run("edit", folder, tmp_path / "out", "--drop", "3.png")
+    assert "note: period 0 has no training images" in result.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
