@@ -227,10 +227,8 @@ def _validate(scene: RawScene, rules: Sequence[Rule]) -> SceneReport:
             findings.extend(_finding(rule, hit) for hit in rule.hits(scene))
         except Exception as error:  # a bug of ours must not hide what other rules find
             found = printable(f"{type(error).__name__}: {error}")
-            expected, todo = (
-                "a rule that runs on every scene",
-                "report this bug; the scene is not at fault",
-            )
+            expected = "a rule that runs on every scene"
+            todo = "report this bug; the scene is not at fault"
             findings.append(_failure(f"rule {rule.code}", expected, found, todo))
     try:
         summary = _summarise(scene)
