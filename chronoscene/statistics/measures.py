@@ -86,9 +86,9 @@ def _measures(views: Ints, residual: Array, baselines: Array, coverage: float | 
         points_seen=len(length),
         observations=int(length.sum()),
         track_mean=_mean(length),
-        track_median=_median(length),
+        track_median=median_of(length),
         reprojection_error=_mean(residual),
-        baseline=_median(baselines),
+        baseline=median_of(baselines),
         coverage=coverage,
     )
 
@@ -215,7 +215,8 @@ def _mean(values: Array | Ints) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def _median(values: Array | Ints) -> float | None:
+def median_of(values: Array | Ints) -> float | None:
+    """Compute the median of the finite values; None if there are none."""
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else None
 

@@ -24,6 +24,7 @@ from chronoscene.io.tables import csv_text
 from chronoscene.registration.output import CERTIFICATE
 from chronoscene.registration.report.coordinates import GEOREFERENCE
 from chronoscene.scene import Scene
+from chronoscene.statistics.measures import median_of
 from chronoscene.survey.cloud import PointCloud, dense_cloud, sparse_cloud
 from chronoscene.survey.difference import measure_volumes, subtract
 from chronoscene.survey.distances import measure_distances
@@ -115,7 +116,7 @@ class Survey:
         return {
             "registration": asdict(found.registration),
             "stable_ground": asdict(found.stable),
-            "level_of_detection": _median(found.level),
+            "level_of_detection": median_of(found.level),
             "changed_share": float(found.significant.sum() / max(known.sum(), 1)),
             "volumes": [
                 asdict(measure_volumes(found, grid, name, *polygon))
@@ -143,8 +144,8 @@ class Survey:
         return {
             "m3c2": {
                 "core_points": len(significant),
-                "median": _median(found.values),
-                "level_of_detection": _median(found.level),
+                "median": median_of(found.values),
+                "level_of_detection": median_of(found.level),
                 "changed_share": float(significant.mean()) if len(significant) else None,
             }
         }
@@ -238,7 +239,7 @@ def survey_run(
         clouds[period] = dense_cloud(views, work.frame, grid)
         work.write_period(period, grid, surface)
         known = float(np.isfinite(surface.heights).mean())
-        summary = {"known_share": known, "height_deviation": _median(surface.spread)}
+        summary = {"known_share": known, "height_deviation": median_of(surface.spread)}
         periods.append(work.write_cloud(period, clouds[period]) | summary)
     for number, pair in enumerate(options.pairs, run.num_periods):
         report("survey", number, steps)
@@ -287,8 +288,3 @@ def _spacing(xyz: Array) -> float:
 
 def _optional(path: Path) -> dict[str, Any]:
     return dict(read_json_document(path)) if path.is_file() else {}
-
-
-def _median(values: Array) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else None
