@@ -44,11 +44,6 @@ def progress_bar(first: str = "") -> Iterator[Report]:
         yield report
 
 
-def announce(step: str) -> None:
-    """Print the name of a step whose progress cannot be counted."""
-    say(step)
-
-
 def tracked(items: Iterable[T], what: str, *, total: int | None = None) -> Iterator[T]:
     """Yield items while a bar counts the finished ones.
 

@@ -8,8 +8,7 @@ import click
 from click.core import ParameterSource
 
 from chronoscene.cli.options import DEVICE, PLUGIN, RUN, SCENE
-from chronoscene.cli.output import emit, report_written
-from chronoscene.cli.progress import announce
+from chronoscene.cli.output import emit, report_written, say
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import read_run
 from chronoscene.harness.use.compression import compress_run
@@ -48,8 +47,8 @@ def command(
             todo="omit one of them",
         )  # fmt: skip
     run = open_run(folder, device=device, plugin=plugin)
-    announce("read the scene")
-    out = compress_run(run, run.scene(scene), max_loss=None if plain else max_loss, log=announce)
+    say("read the scene")
+    out = compress_run(run, run.scene(scene), max_loss=None if plain else max_loss, log=say)
     before, after = run.record, read_run(out)
     sizes = [record.checkpoint_bytes or 0 for record in (before, after)]
     lines = [f"{sizes[0]:,} bytes -> {sizes[1]:,} bytes, {sizes[1] / sizes[0]:.1%}"]

@@ -7,8 +7,7 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE, STAGE
-from chronoscene.cli.output import check_file, check_place, emit, report_written
-from chronoscene.cli.progress import announce
+from chronoscene.cli.output import check_file, check_place, emit, report_written, say
 from chronoscene.errors import ConfigError
 from chronoscene.harness.use.export import make_file, period_files, prepare
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
@@ -84,7 +83,7 @@ def command(
 
 
 def _read_scene(run: TrainedRun, root: Path | None) -> Scene:
-    announce("read the scene")
+    say("read the scene")
     return run.scene(root)
 
 
@@ -92,9 +91,9 @@ def _make(
     run: TrainedRun, scene: Scene, period: float, name: str, kind: str, viewers: str | None
 ) -> bytes:
     """Make the file of a period; print what it holds and what it loses."""
-    announce(f"export period {name}")
+    say(f"export period {name}")
     prepared = prepare(run, scene, period, viewers)
-    announce(f"write and measure period {name}")
+    say(f"write and measure period {name}")
     made = make_file(run, scene, period, prepared, kind)
     size = f"{len(made.data) / 1e6:.2f} MB"
     lines = [f"{len(prepared.cloud):,} Gaussians of period {name}, {size}", *made.comments[1:]]

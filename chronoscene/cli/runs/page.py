@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import DEVICE, FOLDER, PATH, PLUGIN, SCENE
-from chronoscene.cli.output import check_place, emit, report_written
-from chronoscene.cli.progress import announce, progress_bar
+from chronoscene.cli.output import check_place, emit, report_written, say
+from chronoscene.cli.progress import progress_bar
 from chronoscene.harness.use.page import PageSummary, check_runs, chosen_periods, write_page
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside
@@ -49,7 +49,7 @@ def command(
     check_outside(out, scenes, option="--out")
     check_place("--out", out)
     periods = chosen_periods(runs[0], period)
-    announce("read the scene")
+    say("read the scene")
     trained_on = runs[0].scene(scene)
     with progress_bar() as report:
         summary = write_page(

@@ -10,7 +10,7 @@ import click
 
 from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE, refuse_options
 from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
-from chronoscene.cli.progress import announce, progress_bar
+from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.runs.changes import BETWEEN, parse_pairs
 from chronoscene.cli.scenes.reading import read_and_note
 from chronoscene.harness.files.records import RUN_FILE
@@ -64,7 +64,7 @@ def command(
     if not is_run:
         refuse_options(("device", "plugin"), "for a scene without a model")
     run = open_run(source, device=device, plugin=plugin) if is_run else None
-    announce("read the scene")
+    say("read the scene")
     found = read_and_note(source, None, None) if run is None else run.scene(scene)
     check_outside(out, [found.root], option="--out")
     labels = [period.label for period in found.periods]

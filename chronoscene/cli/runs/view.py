@@ -9,7 +9,6 @@ import click
 
 from chronoscene.cli.options import DEVICE, PATH, PLUGIN, SCENE, reading_options, refuse_options
 from chronoscene.cli.output import say
-from chronoscene.cli.progress import announce
 from chronoscene.cli.scenes.reading import read_and_note
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RUN_FILE
@@ -54,11 +53,11 @@ def command(
         refuse_options(("dataset_format", "period_by"), "with runs")
         runs = [open_run(folder, device=device, plugin=plugin) for folder in folders]
         check_runs(runs)
-        announce("open the models")
+        say("open the models")
         for run in runs:
             for period in range(run.num_periods):
                 run.model(period)
-        announce("read the scene")
+        say("read the scene")
         content = Content(runs[0].scene(scene), runs)
     elif len(folders) > 1:
         raise ConfigError(

@@ -10,8 +10,8 @@ from typing import Any
 import click
 
 from chronoscene.cli.options import PATH, reading_options, refuse_options
-from chronoscene.cli.output import A_FILE, check_place, emit, writing_to
-from chronoscene.cli.progress import announce, progress_bar
+from chronoscene.cli.output import A_FILE, check_place, emit, say, writing_to
+from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import describe_period, read_and_note, show_note
 from chronoscene.convert import remarks_on
 from chronoscene.errors import ConfigError
@@ -85,7 +85,7 @@ def command(
     if options["strategy"] in ("periods", "none"):
         refuse_options(["fraction", "every"], f"with --strategy {options['strategy']}")
     _check_targets(source, out, scene_out)
-    announce(f"read {source}")
+    say(f"read {source}")
     scene = read_and_note(source, dataset_format, period_by)
     settings = SplitSettings(fraction=_fraction(fraction, every), **options)
     names = [f.name for f in scene.frames] if settings.strategy == "date" else []

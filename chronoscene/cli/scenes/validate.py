@@ -10,7 +10,7 @@ import click
 
 from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit, say, terminal_width
-from chronoscene.cli.progress import announce, tracked
+from chronoscene.cli.progress import tracked
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted
@@ -115,7 +115,7 @@ def command(
         check_place("--fix", fix)
         folders = _fix(folder, folders, fix, read)
     if len(folders) == 1:
-        announce(f"check {folders[0]}")
+        say(f"check {folders[0]}")
         reports = [check(folders[0], track=tracked)]
     else:
         done = map_parallel(check, folders, lost=lost_report)
@@ -154,7 +154,7 @@ def _fix(folder: Path, scenes: Sequence[Path], out: Path, options: ReadOptions) 
         check_fixable(scene, options)  # before any copy is written
     for scene in scenes:
         copy = out if scene == folder else out / scene.name
-        announce(f"correct {scene}")
+        say(f"correct {scene}")
         repairs = fix_scene(scene, copy)
         say(f"{copy}: {counted(len(repairs), 'correction')}")
         for repair in repairs:
