@@ -94,8 +94,7 @@ class Reprojection(NamedTuple):
 
 def good_poses(images: RawImages) -> NDArray[np.bool_]:
     """Return True for finite poses with a non-zero quaternion. [I]"""
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(images.quaternions, axis=1)
+    norm = np.linalg.norm(images.quaternions, axis=1)
     return np.isfinite(norm) & (norm > 0) & np.isfinite(images.translations).all(axis=1)
 
 
@@ -104,8 +103,7 @@ def reproject(
 ) -> Iterator[Reprojection]:
     """Project the points of every image with a valid pose, a camera and observations."""
     good = good_poses(images)
-    with np.errstate(all="ignore"):
-        rotations = rotation_from_quaternion(images.quaternions)
+    rotations = rotation_from_quaternion(images.quaternions)
     # One array per coordinate: numpy is several times slower along a short last axis. And `take` is
     # three times faster than indexing.
     xyz = np.ascontiguousarray(points.xyz.T)
@@ -116,10 +114,9 @@ def reproject(
             continue
         place = xyz.take(seen.point.take(rows), axis=1)
         u, v = uv.take(seen.keypoint.take(rows), axis=1)
-        with np.errstate(all="ignore"):  # infinite for absurd poses
-            local = _transform(rotations[image], images.translations[image], *place)
-            x, y = project_points(camera, local.T).T  # NaN behind the camera
-            depth, error = local[2], np.sqrt((x - u) ** 2 + (y - v) ** 2)
+        local = _transform(rotations[image], images.translations[image], *place)
+        x, y = project_points(camera, local.T).T  # NaN behind the camera
+        depth, error = local[2], np.sqrt((x - u) ** 2 + (y - v) ** 2)  # infinite for absurd poses
         # Points and keypoints that are not finite have their own rules.
         known = np.isfinite(place).all(axis=0) & np.isfinite(u) & np.isfinite(v)
         if not known.all():

@@ -1,7 +1,8 @@
 """A scene folder as it is on disk: read lazily, part by part, with nothing repaired.
 
 A part that cannot be read is None, and `RawScene.reason` explains; rules that need it are skipped
-with that reason. Nothing here raises for what is on disk.
+with that reason. Nothing here raises for what is on disk; numbers may become infinite or NaN, so it
+is used in `chronoscene.validation.run.quiet_numbers`.
 """
 
 from __future__ import annotations
@@ -204,9 +205,8 @@ class RawScene:
         """Camera centres in the world, NaN for invalid poses. [I, 3]"""
         if self.images is None:
             return np.zeros((0, 3))
-        with np.errstate(all="ignore"):  # absurd translations become infinite
-            rotations = rotation_from_quaternion(self.images.quaternions)
-            centres = -np.einsum("nji,nj->ni", rotations, self.images.translations)
+        rotations = rotation_from_quaternion(self.images.quaternions)
+        centres = -np.einsum("nji,nj->ni", rotations, self.images.translations)
         centres[~(observations.good_poses(self.images) & np.isfinite(centres).all(axis=1))] = np.nan
         return centres
 

@@ -168,17 +168,16 @@ class _Sample:
 
     def error(self, order: str, meaning: str, axes: str) -> float:
         """Median reprojection error in pixels in a convention, without distortion."""
-        with np.errstate(all="ignore"):
-            rotation = rotation_from_quaternion(self._quaternion[:, ORDERS[order]])
-            translation = self._translation
-            which = MEANINGS.index(meaning)
-            if which in (1, 3):
-                rotation = np.swapaxes(rotation, 1, 2)
-            if which in (1, 2):
-                translation = -np.einsum("nij,nj->ni", rotation, translation)
-            local = np.einsum("nij,nj->ni", rotation, self._xyz) + translation
-            local = local * AXES[axes]
-            xy = local[:, :2] / local[:, 2:] * self._focal + self._middle
-            distance = np.linalg.norm(xy - self._pixels, axis=1)
+        rotation = rotation_from_quaternion(self._quaternion[:, ORDERS[order]])
+        translation = self._translation
+        which = MEANINGS.index(meaning)
+        if which in (1, 3):
+            rotation = np.swapaxes(rotation, 1, 2)
+        if which in (1, 2):
+            translation = -np.einsum("nij,nj->ni", rotation, translation)
+        local = np.einsum("nij,nj->ni", rotation, self._xyz) + translation
+        local = local * AXES[axes]
+        xy = local[:, :2] / local[:, 2:] * self._focal + self._middle
+        distance = np.linalg.norm(xy - self._pixels, axis=1)
         distance[~(local[:, 2] > 0) | np.isnan(distance)] = np.inf
         return float(np.median(distance))
