@@ -53,7 +53,6 @@ def read(path: Path, *, model: Model | None = None, empty_periods: bool = False)
         model: Its COLMAP model, where that was read before.
         empty_periods: Accept periods without an image in the model.
     """
-    path = Path(path)
     entries, problems = splits.parse_split_text(read_text(path / SPLIT))
     raise_first(path / SPLIT, problems)
     model = model or _read_model(path)
@@ -214,7 +213,6 @@ def write(
         image_source: What to do with the images; see `IMAGE_SOURCES`.
         progress: Called after each image.
     """
-    out = Path(out)
     for frame in scene.frames:
         check_writable_name(out, frame)
     with staged_folder(out) as staged:

@@ -146,7 +146,7 @@ def write(
     readable = partial(colmap_layout.readable_camera, models=PINHOLE_MODELS, loader="CL-Splats")
     return colmap_layout.write_renamed(
         scene.with_frames([replace(f, camera=readable(f.camera)) for f in scene.frames]),
-        Path(out),
+        out,
         _written_names(scene),
         texts=(our_format.PERIODS, our_format.WORLD),
         image_source=image_source,

@@ -110,7 +110,7 @@ def write(
     """
     return colmap_layout.write_renamed(
         scene,
-        Path(out),
+        out,
         _names(scene),
         texts=(our_format.TEST, our_format.PERIODS, our_format.WORLD),
         image_source=image_source,

@@ -98,7 +98,6 @@ def is_raw(file: Path) -> bool:
 
 def read(path: Path, *, period_by: str | None = None) -> Scene:
     """Read a scene."""
-    path = Path(path)
     cameras = CameraTable()
     images: dict[str, PosedImage] = {}
     labels: dict[str, list[str]] = {}

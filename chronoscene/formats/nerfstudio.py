@@ -93,7 +93,7 @@ class _Document:
 
 def read(path: Path, *, period_by: str | None = None) -> Scene:
     """Read a scene."""
-    file = _read_document(Path(path))
+    file = _read_document(path)
     images, tests, rule = _apply_lists(file, _read_images(file))
     grouped = _group(file, [image.name for image in images], period_by)
     scene = transforms.make_scene(
@@ -299,7 +299,6 @@ def write(
     Labels, dates and the world frame go to the extra keys ``periods`` and ``world``. Tracks and ids
     of points have no place in this format.
     """
-    out = Path(out)
     for frame in scene.frames:
         check_name(out, frame.name)
     finite = _finite(scene.points)

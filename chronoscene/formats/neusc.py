@@ -64,7 +64,6 @@ def matches(path: Path) -> bool:
 
 def read(path: Path, *, period_by: str = "year") -> Scene:
     """Read a scene."""
-    path = Path(path)
     model, _ = _read_images(path)
     used = _used_names(path, model)
     dates = {name: when for name in used if (when := _date(path, name)) is not None}
@@ -104,7 +103,7 @@ def write(
     readable = partial(colmap_layout.readable_camera, models=("PINHOLE",), loader="NeuSC")
     return colmap_layout.write_renamed(
         scene.with_frames([replace(f, camera=readable(f.camera)) for f in scene.frames]),
-        Path(out),
+        out,
         names,
         texts=(our_format.PERIODS, our_format.WORLD),
         image_source=image_source,

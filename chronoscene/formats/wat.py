@@ -87,7 +87,7 @@ def write(
     camera = _one_camera(scene, out)
     return colmap_layout.write_renamed(
         scene.with_frames([replace(frame, camera=camera) for frame in scene.frames]),
-        Path(out),
+        out,
         _names(scene),
         texts=(our_format.PERIODS, our_format.WORLD),
         image_source=image_source,

@@ -190,7 +190,6 @@ def validate_scene(
     Raises:
         ConfigError: If the format has no such periods.
     """
-    path = Path(path)
     chosen = all_rules() if rules is None else rules
     detected = other_format(path, options)
     with quiet_numbers():
