@@ -148,6 +148,8 @@ def table(
     standard deviation and the number of runs. Intervals and differences are at 95 % over test
     views.
     """
+    if style in ("csv", "json"):  # they have fixed columns, and no titles
+        refuse_options(("columns", "renames"), f"with {style}")
     records, failures = read_runs(folders)
     if region != ALL:
         records = in_region(records, region)
@@ -160,32 +162,15 @@ def table(
         parse_metrics(metrics),
         published=published,
         periods=periods,
-        renames=_renames(renames, style),
-        columns=_columns(columns, style),
+        renames=dict(_pair(text) for text in renames),
+        columns=() if columns is None else split_list("--columns", columns),
         width=width,
     )
     emit(text, out)
 
 
-def _columns(text: str | None, style: str) -> tuple[str, ...]:
-    _refuse_with_data("--columns", text, style)
-    return () if text is None else split_list("--columns", text)
-
-
-def _renames(texts: tuple[str, ...], style: str) -> dict[str, str]:
-    _refuse_with_data("--rename", texts[0] if texts else None, style)
-    return dict(_pair(text) for text in texts)
-
-
-def _refuse_with_data(option: str, text: str | None, style: str) -> None:
-    """Refuse an option on what people read: CSV and JSON have fixed columns, and no titles."""
-    if text is not None and style in ("csv", "json"):
-        raise ConfigError(
-            option, expected=f"none with {style}", found=repr(text), todo="leave it out"
-        )
-
-
 def _pair(text: str) -> tuple[str, str]:
+    """Split a value of ``--rename``."""
     old, _, new = text.rpartition("=")  # names have options, such as sh_degree=2
     if not old:
         raise ConfigError(

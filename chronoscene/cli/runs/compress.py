@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-from click.core import ParameterSource
 
-from chronoscene.cli.options import DEVICE, PLUGIN, RUN, SCENE
+from chronoscene.cli.options import DEVICE, PLUGIN, RUN, SCENE, refuse_options
 from chronoscene.cli.output import emit, report_written, say
-from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import read_run
 from chronoscene.harness.use.compression import compress_run
 from chronoscene.harness.use.trained_run import open_run
@@ -40,12 +38,8 @@ def command(
     RUN is the folder of the run, such as runs/plaza/chronogs-joint-balanced/seed0. The compressed
     model becomes a run beside it, with its own scores and its own row in chronoscene table.
     """
-    source = click.get_current_context().get_parameter_source("max_loss")
-    if plain and source is ParameterSource.COMMANDLINE:
-        raise ConfigError(
-            "--max-loss", expected="no --plain, which does not round to a loss", found="both",
-            todo="omit one of them",
-        )  # fmt: skip
+    if plain:
+        refuse_options(["max_loss"], "with --plain, which does not round to a loss")
     run = open_run(folder, device=device, plugin=plugin)
     say("read the scene")
     out = compress_run(run, run.scene(scene), max_loss=None if plain else max_loss, log=say)

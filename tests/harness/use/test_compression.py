@@ -108,7 +108,7 @@ def test_the_loss_is_that_of_the_file_though_a_position_is_far_away(tmp_path):
 
 
 def test_a_loss_means_nothing_to_the_plain_form(trained):
-    with pytest.raises(ConfigError, match="--max-loss: expected no --plain"):
+    with pytest.raises(ConfigError, match="--max-loss: expected none with --plain"):
         compress(trained["chronogs"], "--plain", "--max-loss", "0.5")
 
 
