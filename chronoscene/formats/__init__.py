@@ -5,9 +5,9 @@ A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and wher
 - ``write(scene, out, image_source=..., progress=...)`` and ``losses(scene)``, which lists what of
   the scene the format cannot hold;
 - ``PERIOD_BY``, the values of ``read(path, period_by=...)``, where periods can be chosen;
-- ``assign(images, names, ...)``, which a format has whose periods follow from the image names of a
-  COLMAP model: so the validator can look at that model as it is. Then `detect` looks for the model,
-  and the functions are ``matches(path, model)`` and ``read(path, model=..., ...)``;
+- ``assign(images, names, ...)``, where the periods follow from the image names of a COLMAP model,
+  which the validator then checks as it is. For such a format, `detect` looks for the model, and the
+  functions are ``matches(path, model)`` and ``read(path, model=..., ...)``;
 - ``remarks(path)``, which lists what of a folder does not become part of the scene.
 
 All raise a `SceneError` for a damaged scene, ``write`` also for a folder that is in use and for

@@ -47,7 +47,6 @@ _DECODE_ERRORS = (
     Image.DecompressionBombError,
 )
 
-
 Photo = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 """Colours, and a mask of those that count; see `load_photo`. [H, W, 3], [H, W]"""
 

@@ -38,7 +38,6 @@ _DATE = re.compile(
     re.ASCII,
 )
 
-
 RTK_FIXED, RTK_FLOAT = 50, 34
 """Values of ``RtkFlag``; 16 is a position without corrections, 0 is none."""
 

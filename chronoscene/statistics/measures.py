@@ -221,7 +221,7 @@ def median_of(values: Array | Ints) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
-# What of a scene is looked at
+# Parts of a scene that are looked at
 
 MAX_POINTS, MIN_POINTS_PER_PERIOD = 4000, 400
 """Points of all periods together that are looked for, and of each: a share is known to a percent or

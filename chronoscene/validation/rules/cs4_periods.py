@@ -18,8 +18,6 @@ MIN_TRAIN = 5  # Training views below which a period can hardly be reconstructed
 UNEVEN = 3  # Ratio between the number of test views of a period and its fair share
 MIN_OFF = 3  # Deviation from the fair share, in test views, that is worth a warning
 UNEQUAL = 10  # Ratio between the numbers of training views of two periods
-
-
 RARE = 4  # Ratio of lines of the usual period to those of one whose id may be a typing error
 
 NUMBER = "number the periods from 0 without gaps; put labels and dates into sparse/periods.json"
