@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from errno import EISDIR
 from os import strerror
@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from chronoscene.errors import ConfigError
-from chronoscene.io.staging import is_stream, write_text_atomic
+from chronoscene.io.staging import check_outside, is_stream, write_text_atomic
 from chronoscene.io.tables import FORMATS
 from chronoscene.io.wording import printable, printable_lines
 
@@ -95,29 +95,39 @@ def writing_to(
         ) from error
 
 
-def check_place(option: str, folder: Path) -> None:
+def check_place(option: str, folder: Path, *, outside: Iterable[Path] = ()) -> None:
     """Check that a folder can be created and written to; create nothing.
 
+    Args:
+        option: Option that named the folder.
+        folder: It need not exist.
+        outside: Scenes, and folders of photos, that it must not be in.
+
     Raises:
-        ConfigError: If it cannot.
+        ConfigError: If it cannot, or is in one of them.
     """
+    check_outside(folder, outside, option=option)
     with writing_to(option, folder):
         nearest = next(p for p in (folder, *folder.absolute().parents) if p.exists())
         with TemporaryFile(dir=nearest):
             pass
 
 
-def check_file(option: str, file: Path | None) -> None:
+def check_file(option: str, file: Path | None, *, outside: Iterable[Path] = ()) -> None:
     """Check that a file can be written; leave nothing there.
 
     Args:
         option: Option that named the file.
         file: None if there is none to write.
+        outside: As for `check_place`.
 
     Raises:
-        ConfigError: If it cannot.
+        ConfigError: If it cannot, or is in one of them.
     """
-    if file is None or is_stream(file):
+    if file is None:
+        return
+    check_outside(file, outside, option=option)
+    if is_stream(file):
         return
     with writing_to(option, file, expected=A_FILE):
         if file.is_dir():

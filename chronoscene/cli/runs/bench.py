@@ -34,7 +34,6 @@ from chronoscene.harness.plan.settings import (
 from chronoscene.harness.plan.stop import parse_duration
 from chronoscene.harness.run.runner import BenchOutcome, run_bench
 from chronoscene.images.store import MAX_WIDTH
-from chronoscene.io.staging import check_outside
 
 SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 BUDGET = click.option(
@@ -194,8 +193,7 @@ def settings_from(
         photo_disk=round(photo_disk * 1e9),
         **options,
     )
-    check_outside(out, [scene.path for scene in settings.scenes], option="--out")
-    check_place("--out", out)
+    check_place("--out", out, outside=[scene.path for scene in settings.scenes])
     return settings
 
 

@@ -11,7 +11,7 @@ from chronoscene.cli.output import check_file, check_place, emit, report_written
 from chronoscene.errors import ConfigError
 from chronoscene.harness.use.export import make_file, period_files, prepare
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
-from chronoscene.io.staging import check_outside, replacing, staged_folder
+from chronoscene.io.staging import replacing, staged_folder
 from chronoscene.scene import Scene
 from chronoscene.splat_files import SUFFIXES
 
@@ -64,15 +64,15 @@ def command(
     """
     run = open_run(folder, device=device, plugin=plugin, stage=stage)
     kind = _format_of(out, kind, a_folder=period == ALL)
-    check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
+    scenes = [Path(run.source.scene_root), *([scene] if scene else [])]
     if period != ALL:
-        check_file("--out", out)
+        check_file("--out", out, outside=scenes)
         wanted = run.parse_period(period)
         data = _make(run, _read_scene(run, scene), wanted, period, kind, viewers)
         with replacing(out) as partial:
             partial.write_bytes(data)
     else:
-        check_place("--out", out)
+        check_place("--out", out, outside=scenes)
         read = _read_scene(run, scene)
         with staged_folder(out) as staged:
             labels = run.record.period_labels

@@ -11,7 +11,6 @@ from chronoscene.cli.output import check_place, emit, report_written, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.harness.use.page import PageSummary, check_runs, chosen_periods, write_page
 from chronoscene.harness.use.trained_run import open_run
-from chronoscene.io.staging import check_outside
 
 
 @click.command("page")
@@ -46,8 +45,7 @@ def command(
     runs = [open_run(folder, device=device, plugin=plugin) for folder in folders]
     check_runs(runs)
     scenes = [Path(runs[0].source.scene_root), *([scene] if scene else [])]
-    check_outside(out, scenes, option="--out")
-    check_place("--out", out)
+    check_place("--out", out, outside=scenes)
     periods = chosen_periods(runs[0], period)
     say("read the scene")
     trained_on = runs[0].scene(scene)

@@ -26,7 +26,6 @@ from chronoscene.harness.use.rendering import (
     write_pictures,
 )
 from chronoscene.harness.use.trained_run import open_run
-from chronoscene.io.staging import check_outside
 from chronoscene.kernels.runtime import keep_freed_memory
 
 
@@ -131,9 +130,9 @@ def command(
     """
     keep_freed_memory()  # arrays as large as those of the picture before
     run = open_run(folder, device=device, plugin=plugin, stage=stage)
-    check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
+    scenes = [Path(run.source.scene_root), *([scene] if scene else [])]
     if is_animation(out):
-        check_file("--out", out)
+        check_file("--out", out, outside=scenes)
     elif (guess_type(out)[0] or "").startswith(("image/", "video/")):
         raise ConfigError(
             "--out",
@@ -143,7 +142,7 @@ def command(
         )
     else:
         refuse_options(("fps",), "for a folder of pictures")
-        check_place("--out", out)
+        check_place("--out", out, outside=scenes)
     periods = () if period is None else run.parse_periods(period)
     appearance = None if appearance_period is None else run.parse_period(appearance_period)
     found = find_viewpoints(cameras, run, scene, frames, OrbitShape(size, radius, height))

@@ -21,7 +21,6 @@ from chronoscene.formats import read_scene
 from chronoscene.harness.files.records import write_summary
 from chronoscene.harness.score.images import score_images
 from chronoscene.images.store import MAX_WIDTH
-from chronoscene.io.staging import check_outside
 from chronoscene.metrics.registry import make_scorers
 
 
@@ -68,8 +67,7 @@ def command(
     Images have the size of the evaluation or of the photos. The result is a run like those of
     bench; see docs/guides/other-programs.md.
     """
-    check_outside(out, [scene], option="--out")
-    check_place("--out", out)
+    check_place("--out", out, outside=[scene])
     with progress_bar(f"read {scene}") as bar:
         whole = read_scene(scene, format=dataset_format, period_by=period_by)
         bar("load the metrics", 0, 1)

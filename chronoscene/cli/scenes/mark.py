@@ -11,7 +11,7 @@ from chronoscene.cli.output import check_file, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.geodesy import read_reference_system
-from chronoscene.io.staging import check_outside, write_text_atomic
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.photos.captures import photo_folders, read_captures
 from chronoscene.registration.report.marking import marking_page
 from chronoscene.registration.ties.tie_points import read_tie_points
@@ -62,8 +62,7 @@ def command(
     browser, mark points, and save points.csv, which register reads by --tie-points. Coordinates are
     in pixels of the original photos.
     """
-    check_outside(page, photo_folders(captures, table), option="PAGE")
-    check_file("PAGE", page)
+    check_file("PAGE", page, outside=photo_folders(captures, table))
     system = None if crs is None else read_reference_system("--crs", crs, error=ConfigError)
     points = None
     if tie_points is None:

@@ -246,9 +246,7 @@ def _file_names(paths: Sequence[Path]) -> list[str]:
 
 def _check_places(request: StatsRequest, out: Path | None, paths: Sequence[Path]) -> None:
     """Make the folders for figures and pages; refuse to write into a scene."""
-    if out is not None:
-        check_outside(out, paths, option="--out")
-    check_file("--out", out)
+    check_file("--out", out, outside=paths)
     for option, place in (("--figures", request.figures), ("--pages", request.pages)):
         if place is not None:
             check_outside(place, paths, option=option)

@@ -12,7 +12,6 @@ from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit, say, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.io.processes import map_parallel
-from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import keep_freed_memory
 from chronoscene.validation.folder.scene_folder import Track, no_progress
@@ -107,12 +106,9 @@ def command(
     choose_rules(_codes(select), _codes(ignore))  # errors in these options come first
     folders = find_folders(folder)
     for option, file in (("--out", out), ("--sarif", sarif), ("--html", html)):
-        if file is not None:
-            check_outside(file, folders, option=option)
-        check_file(option, file)
+        check_file(option, file, outside=folders)
     if fix is not None:
-        check_outside(fix, folders, option="--fix")
-        check_place("--fix", fix)
+        check_place("--fix", fix, outside=folders)
         folders = _fix(folder, folders, fix, read)
     if len(folders) == 1:
         say(f"check {folders[0]}")
