@@ -74,7 +74,7 @@ def refuse_options(names: Iterable[str], condition: str) -> None:
     for name in names:
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise ConfigError(
-                flags[name], expected=f"none {condition}", found="one", todo="leave one out"
+                flags[name], expected=f"none {condition}", found="one", todo="leave it out"
             )
 
 

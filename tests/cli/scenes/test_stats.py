@@ -208,7 +208,8 @@ def test_cameras_are_drawn_in_figures_only(make_scene_folder):
 def test_a_form_of_figures_that_nobody_asked_for_is_refused(make_scene_folder):
     error = run(make_scene_folder(), "--figure-format", "pdf").exception
     assert isinstance(error, ConfigError)
-    assert "--figure-format: expected none without --figures" in str(error)
+    said = "--figure-format: expected none without --figures, found one; leave it out"
+    assert str(error) == said
 
 
 def test_a_scene_that_is_not_known_as_one_is_not_left_out_in_silence(
