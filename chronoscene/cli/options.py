@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Callable, Iterable
@@ -20,6 +21,23 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 FOLDER = click.Path(path_type=Path, file_okay=False)
 EXISTING_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 EXISTING_FOLDER = click.Path(path_type=Path, exists=True, file_okay=False)
+
+
+class FiniteFloat(click.types.FloatParamType):
+    """A number, which infinity and NaN are not, though click takes them for numbers."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Convert the text of an option."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"expected a finite number, found {number}", param, ctx)
+        return number
+
+
+class FiniteRange(FiniteFloat, click.FloatRange):
+    """A finite number in a range."""
 
 
 def _period_help() -> str:
@@ -147,7 +165,7 @@ _TRAINING = {
     ),
     "job_memory": click.option(
         "--job-memory",
-        type=click.FloatRange(min=0, min_open=True),
+        type=FiniteRange(min=0, min_open=True),
         callback=lambda _context, _option, value: value and round(value * 1e9),
         help="Memory of a run in GB: the next one starts if this much is free.  "
         "[default: an estimate]",

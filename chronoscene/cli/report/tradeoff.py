@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from chronoscene.cli.options import FOLDER, RUNS, refuse_options
+from chronoscene.cli.options import FOLDER, RUNS, FiniteFloat, refuse_options
 from chronoscene.cli.output import (
     FORMAT,
     OUT_FILE,
@@ -59,7 +59,9 @@ FIGURE = "tradeoff.png"
 )
 @click.option("--max-bytes", help="The same for models of this size, such as 500kB, 10MB or 1GB.")
 @click.option(
-    "--target-psnr", type=float, help="The same for this PSNR in dB, in the least training time."
+    "--target-psnr",
+    type=FiniteFloat(),
+    help="The same for this PSNR in dB, in the least training time.",
 )
 def command(
     folders: tuple[Path, ...],

@@ -12,6 +12,7 @@ from chronoscene.cli.options import (
     LPIPS_WEIGHTS,
     RUNS_OUT,
     SCENES,
+    FiniteRange,
     look_here_for,
     parse_assignments,
     reading_options,
@@ -100,13 +101,13 @@ WIDTH = click.option(
 @WIDTH
 @click.option(
     "--photo-memory",
-    type=click.FloatRange(min=0),
+    type=FiniteRange(min=0),
     default=PHOTO_MEMORY / 1e9,
     help="Memory for training photos in GB, the decoding of them included.",
 )
 @click.option(
     "--photo-disk",
-    type=click.FloatRange(min=0),
+    type=FiniteRange(min=0),
     default=PHOTO_DISK / 1e9,
     help="Disk space below --out in GB for decoded photos, if they do not fit into memory.",
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, PLUGIN, RUN, SCENE, refuse_options
+from chronoscene.cli.options import DEVICE, PLUGIN, RUN, SCENE, FiniteRange, refuse_options
 from chronoscene.cli.output import emit, report_written, say
 from chronoscene.harness.files.records import read_run
 from chronoscene.harness.use.compression import compress_run
@@ -17,7 +17,7 @@ from chronoscene.harness.use.trained_run import open_run
 @RUN
 @click.option(
     "--max-loss",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     default=0.1,
     help="Largest loss of PSNR on training views, in dB.",
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, FOLDER, PATH, PLUGIN, SCENE
+from chronoscene.cli.options import DEVICE, FOLDER, PATH, PLUGIN, SCENE, FiniteRange
 from chronoscene.cli.output import check_place, emit, report_written, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.harness.use.page import PageSummary, check_runs, chosen_periods, write_page
@@ -19,7 +19,7 @@ from chronoscene.harness.use.trained_run import open_run
 @click.option("--period", help="Period (number or label) or range FROM:TO in it.  [default: all]")
 @click.option(
     "--max-megabytes",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     default=25,
     help="Size of the folder. Photos of training views are left out first, then spherical "
     "harmonics, then the faintest Gaussians.",

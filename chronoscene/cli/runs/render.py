@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from mimetypes import guess_type
 from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE, STAGE, refuse_options
+from chronoscene.cli.options import (
+    DEVICE,
+    PATH,
+    PLUGIN,
+    RUN,
+    SCENE,
+    STAGE,
+    FiniteFloat,
+    FiniteRange,
+    refuse_options,
+)
 from chronoscene.cli.output import check_file, check_place, report_written
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -44,13 +53,6 @@ def parse_size(
     return size
 
 
-def check_finite(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
-    """Refuse infinity and NaN, as a click callback."""
-    if value is not None and not math.isfinite(value):
-        raise click.BadParameter(f"expected a finite number, found {value}")
-    return value
-
-
 @click.command("render")
 @RUN
 @click.option(
@@ -80,7 +82,7 @@ def check_finite(ctx: click.Context, param: click.Parameter, value: float | None
 )
 @click.option(
     "--fps",
-    type=click.FloatRange(min=0.1, max=240),
+    type=FiniteRange(min=0.1, max=240),
     default=24,
     help="Pictures per second of an animation.",
 )
@@ -92,14 +94,12 @@ def check_finite(ctx: click.Context, param: click.Parameter, value: float | None
 )
 @click.option(
     "--radius",
-    type=click.FloatRange(min=0, min_open=True),
-    callback=check_finite,
+    type=FiniteRange(min=0, min_open=True),
     help="Level distance of an orbit from the middle of the sparse points, in units of the scene.",
 )
 @click.option(
     "--height",
-    type=float,
-    callback=check_finite,
+    type=FiniteFloat(),
     help="Height of an orbit above the middle of the sparse points, in units of the scene.",
 )
 @SCENE

@@ -8,7 +8,15 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import DEVICE, EXISTING_FILE, FOLDER, PLUGIN, SCENE, refuse_options
+from chronoscene.cli.options import (
+    DEVICE,
+    EXISTING_FILE,
+    FOLDER,
+    PLUGIN,
+    SCENE,
+    FiniteRange,
+    refuse_options,
+)
 from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.runs.changes import BETWEEN, parse_pairs
@@ -27,7 +35,7 @@ from chronoscene.survey.products import SurveyOptions, check_packages, write_sur
 @BETWEEN
 @click.option(
     "--resolution",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     help="Edge of a cell in metres.  [default: a pixel of the training photos on the ground]",
 )
 @click.option("--area", type=EXISTING_FILE, help="GeoJSON file with polygons for volumes.")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, refuse_options
+from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, FiniteRange, refuse_options
 from chronoscene.cli.output import check_file, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
@@ -29,7 +29,7 @@ from chronoscene.registration.ties.tie_points import read_tie_points
 )
 @click.option(
     "--tie-scale",
-    type=click.FloatRange(0, min_open=True),
+    type=FiniteRange(0, min_open=True),
     default=1.0,
     help="Size of these photos divided by that of the photos that its points were clicked in.",
 )

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, refuse_options
+from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, FiniteRange, refuse_options
 from chronoscene.cli.output import check_place, emit, showing_notes
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
@@ -69,7 +69,7 @@ FAILED = 1  # Exit status if a verdict is fail
 )
 @click.option(
     "--held-out",
-    type=click.FloatRange(0, 0.5),
+    type=FiniteRange(0, 0.5),
     default=DEFAULTS.held_out,
     help="Share of the tracks across periods that are used only to test the result.",
 )
@@ -122,7 +122,7 @@ FAILED = 1  # Exit status if a verdict is fail
 )
 @click.option(
     "--tie-scale",
-    type=click.FloatRange(0, min_open=True),
+    type=FiniteRange(0, min_open=True),
     default=DEFAULTS.tie_scale,
     help="Size of these photos divided by that of the photos that were clicked in.",
 )
