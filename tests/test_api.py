@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 import re
 import shutil
 import subprocess
@@ -139,6 +140,14 @@ def test_validate_wants_one_scene(in_folder):
         ({"methods": "4gs"}, "expected one of"),
         ({"strategies": "alone"}, "strategy: expected"),
         ({"budget": "soon"}, "budget: expected a positive time"),
+        ({"budget": 0}, "--budget: expected a positive number of seconds, found 0;"),
+        ({"budget": -5.0}, "--budget: expected a positive number of seconds, found -5.0;"),
+        ({"budget": math.nan}, "--budget: expected a positive number of seconds, found nan;"),
+        ({"budget": f"{10**400}h"}, "--budget: expected a positive number of seconds, found inf;"),
+        ({"seeds": (0, -1)}, "--seed: expected 0 or more, found -1;"),
+        ({"max_width": 0}, "--max-width: expected 1 or more, found 0;"),
+        ({"threads": -1}, "--threads: expected 1 or more, found -1;"),
+        ({"jobs": 0}, "--jobs: expected 1 or more, found 0;"),
         ({"preset": "quick"}, "--preset"),
         ({"overrides": {"chronogs.size": 3}}, "--set"),
         ({"scenes": "nowhere"}, "nowhere: expected"),

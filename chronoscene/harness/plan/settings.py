@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from itertools import chain
@@ -100,9 +101,11 @@ class BenchSettings:
         """Refuse settings that contradict each other.
 
         Raises:
-            ConfigError: If a strategy or a way of sharing is unknown, several options give a number
-                of iterations, of which one would win silently, or one contradicts the protocol.
+            ConfigError: If a strategy or a way of sharing is unknown, a number is too small,
+                several options give a number of iterations, of which one would win silently, or one
+                contradicts the protocol.
         """
+        self._check_numbers()
         for strategy in self.strategies:
             check_choice("--strategy", strategy, STRATEGIES)
         if self.run.separate_iterations is not None:
@@ -126,6 +129,31 @@ class BenchSettings:
                 expected=f"no {' and no '.join(options[1:])} beside it",
                 found=" and ".join(options[1:]),
                 todo="leave all of them but one out",
+            )
+
+    def _check_numbers(self) -> None:
+        """Refuse numbers that no option of a command lets through."""
+        least = {
+            "--max-width": (self.run.max_width, 1),
+            "--threads": (self.run.threads, 1),
+            "--jobs": (self.jobs, 1),
+            "--seed": (min(self.seeds, default=0), 0),
+        }
+        for option, (number, smallest) in least.items():
+            if number is not None and number < smallest:
+                raise ConfigError(
+                    option,
+                    expected=f"{smallest} or more",
+                    found=str(number),
+                    todo="choose another number",
+                )
+        budget = self.run.budget_seconds
+        if budget is not None and not 0 < budget < math.inf:
+            raise ConfigError(
+                "--budget",
+                expected="a positive number of seconds",
+                found=str(budget),
+                todo="choose another number, or leave it out",
             )
 
 
