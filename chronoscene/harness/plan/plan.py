@@ -39,17 +39,18 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     """Resolve and check all runs asked for; freezes the ground truth of the scenes."""
     shared = settings.run
     methods = resolve_methods(settings.methods, shared)
+    asked = [(m, s) for m in methods for s in settings.strategies or (m.spec.strategy,)]
     if shared.separate_iterations is not None:
-        _check_sharing(settings, methods)
+        _check_sharing(asked)
     if settings.ray is None:  # else the machine that runs a job checks its own
         gsplat = any(method.spec.draws_gaussians for method in methods)
         check_device(shared.device, gsplat=gsplat)
     runs: dict[Path, ResolvedRun] = {}
     todo: dict[Path, ResolvedRun] = {}
     for scene in read_scenes(settings, log):
-        asked = {run.job.folder: run for run in _runs_of_scene(settings, scene, methods)}
-        missing = {k: run for k, run in asked.items() if is_to_do(run, settings.overwrite)}
-        for folder, run in asked.items() if shared.keep_training else ():
+        of_scene = {run.job.folder: run for run in _runs_of_scene(settings, scene, asked)}
+        missing = {k: run for k, run in of_scene.items() if is_to_do(run, settings.overwrite)}
+        for folder, run in of_scene.items() if shared.keep_training else ():
             kept = (folder / TRAINING).is_dir() or run.job.training.is_dir()
             if folder not in missing and not kept:
                 log(f"note: {folder} has its model alone: delete it to keep a training there")
@@ -63,20 +64,19 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
                 if line := device_need(scene.content, scene.needs, *needed):
                     log(line)
         freeze_ground_truth(shared.runs, scene.content, scene.hash, shared.max_width)
-        runs |= asked
+        runs |= of_scene
         todo |= missing
     for notice in dict.fromkeys(chain(*(run.job.notices for run in runs.values()))):
         log(f"note: {notice}")
     return Plan(runs, todo)
 
 
-def _check_sharing(settings: BenchSettings, methods: list[ResolvedMethod]) -> None:
-    """Refuse a way of sharing iterations where no run has any.
+def _check_sharing(asked: list[tuple[ResolvedMethod, str]]) -> None:
+    """Refuse a way of sharing iterations where no method has any under its strategies.
 
     Raises:
         ConfigError: If that is so.
     """
-    asked = [(m, s) for m in methods for s in settings.strategies or (m.spec.strategy,)]
     if not any(method.has_sharing(strategy) for method, strategy in asked):
         raise ConfigError(
             "--separate-iterations",
@@ -87,14 +87,9 @@ def _check_sharing(settings: BenchSettings, methods: list[ResolvedMethod]) -> No
 
 
 def _runs_of_scene(
-    settings: BenchSettings, scene: BenchScene, methods: list[ResolvedMethod]
+    settings: BenchSettings, scene: BenchScene, asked: list[tuple[ResolvedMethod, str]]
 ) -> Iterator[ResolvedRun]:
-    """Yield every method, strategy and seed on one scene, checked."""
-    asked = [
-        (method, strategy)
-        for method in methods
-        for strategy in settings.strategies or (method.spec.strategy,)
-    ]
+    """Yield every method, with each of its strategies and seeds, on one scene, checked."""
     for (method, wanted), seed in product(asked, settings.seeds):
         strategy, notices = _strategy(method, wanted)
         own = method.settings

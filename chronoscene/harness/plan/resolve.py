@@ -79,12 +79,7 @@ class ResolvedMethod:
         budget_each = settings.separate_iterations == "each" and settings.budget_seconds is not None
         if budget_each or settings.separate_iterations != self._own_sharing:
             differ["separate_iterations"] = settings.separate_iterations
-        if settings.validation:
-            differ["validation"] = True
-        if settings.fit_half:
-            differ["fit_half"] = True
-        if settings.protocol:
-            differ["protocol"] = settings.protocol
+        differ |= _unusual(settings)
         variant = ",".join(f"{k}={as_typed(v)}" for k, v in differ.items())
         return ResolvedRun.of(replace(job, variant=variant), self.spec, config)
 
@@ -118,9 +113,7 @@ class ResolvedRun:
             "separate_iterations": settings.separate_iterations,
             "max_width": settings.max_width,
             **({"continued_from": job.continued_from} if job.continued_from else {}),
-            **({"validation": True} if settings.validation else {}),
-            **({"fit_half": True} if settings.fit_half else {}),
-            **({"protocol": settings.protocol} if settings.protocol else {}),
+            **_unusual(settings),
         }
         decides = json.loads(json.dumps(decides))
         document = {
@@ -236,6 +229,12 @@ def _config(spec: MethodSpec, settings: RunSettings) -> MethodConfig:
             todo="correct --iterations",
         )
     return config
+
+
+def _unusual(settings: RunSettings) -> dict[str, Any]:
+    """Return settings that most runs leave empty, as far as these do not."""
+    names = ("validation", "fit_half", "protocol")
+    return {name: value for name in names if (value := getattr(settings, name))}
 
 
 def _known_before(options: Mapping[str, Any]) -> dict[str, Any]:
