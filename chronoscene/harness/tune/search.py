@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -180,58 +180,54 @@ def _run_trials(
     search: _Search, trials: int, missing: int, log: Log, execute: Execute | None
 ) -> None:
     queue = islice(_queue(search, trials), missing)  # more may be left if several ran at a time
-    refusals = 0
     under_way: dict[Future[BenchOutcome], Trial] = {}
     with open_pool(search.settings) as opened:
         pool = opened or LocalPool(1)
         total = missing * len(search.settings.scenes)
         with RunsDisplay(total, log) as display, ThreadPoolExecutor(pool.at_once) as threads:
+            accepted = _accepted(search, queue, display.log)
             try:
                 while True:
-                    while len(under_way) < pool.at_once and (trial := next(queue, None)):
-                        settings = search.trial_settings(trial)
-                        try:
-                            resolve_methods(settings.methods, settings.run)
-                        except ConfigError as error:
-                            refusals += 1
-                            _finish(search, trial, _refused(search, error), display.log)
-                            if refusals == REFUSALS:
-                                raise _no_options(search, error) from error
-                            continue
-                        refusals = 0
+                    while len(under_way) < pool.at_once and (ready := next(accepted, None)):
+                        trial, settings = ready
                         plan = plan_runs(settings, _silent)
                         future = threads.submit(_run, plan, settings, pool, display, execute)
                         under_way[future] = trial
                     if not under_way:
                         return
                     for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-                        _finish(search, under_way.pop(future), future.result(), display.log)
+                        outcome = future.result()
+                        reasons = [failure.reason for failure in outcome.failures]
+                        trial = under_way.pop(future)
+                        _finish(search, trial, outcome.finished, reasons, display.log)
             except BaseException:
                 pool.stop.ask()
                 raise
 
 
-def _refused(search: _Search, error: ConfigError) -> BenchOutcome:
-    """Return the outcome of a trial whose options the method refuses."""
-    failure = records.Failure(
-        method=search.method.spec.name,
-        strategy=search.settings.strategies[0],
-        preset=search.settings.run.preset_name,
-        variant="",
-        scene="",
-        seed=search.seed,
-        reason=str(error),
-    )
-    return BenchOutcome(finished=(), skipped=0, failures=(failure,))
-
-
-def _no_options(search: _Search, error: ConfigError) -> ConfigError:
-    return ConfigError(
-        f"tune {search.method.spec.name}",
-        expected="a search space whose options the method takes",
-        found=f"{REFUSALS} refusals in a row; the last one: {error}",
-        todo="narrow the search space in its MethodSpec, and choose another folder with --out",
-    )
+def _accepted(
+    search: _Search, queue: Iterable[Trial], log: Log
+) -> Iterator[tuple[Trial, BenchSettings]]:
+    """Yield trials with their settings; those whose options the method refuses have failed."""
+    refusals = 0
+    for trial in queue:
+        settings = search.trial_settings(trial)
+        try:
+            resolve_methods(settings.methods, settings.run)
+        except ConfigError as error:
+            refusals += 1
+            _finish(search, trial, (), [str(error)], log)
+            if refusals == REFUSALS:
+                raise ConfigError(
+                    f"tune {search.method.spec.name}",
+                    expected="a search space whose options the method takes",
+                    found=f"{REFUSALS} refusals in a row; the last one: {error}",
+                    todo="narrow the search space in its MethodSpec, and choose another folder "
+                    "with --out",
+                ) from error
+        else:
+            refusals = 0
+            yield trial, settings
 
 
 def _silent(line: str) -> None:
@@ -270,15 +266,25 @@ def _run(
     return run_plan(plan, settings, _silent, execute=execute or in_pool)
 
 
-def _finish(search: _Search, trial: Trial, outcome: BenchOutcome, log: Log) -> None:
-    """Record the result of a trial, and delete what it was made from."""
+def _finish(
+    search: _Search, trial: Trial, finished: Sequence[Path], reasons: Sequence[str], log: Log
+) -> None:
+    """Record the result of a trial, and delete what it was made from.
+
+    Args:
+        search: The search.
+        trial: A trial that has ended.
+        finished: Folders of its finished runs.
+        reasons: Why it has no others.
+        log: Called with a line on the trial.
+    """
     from optuna.trial import TrialState
 
-    runs = [records.read_run(folder) for folder in outcome.finished]
+    runs = [records.read_run(folder) for folder in finished]
     values = [run.aggregates["macro"].get("psnr", math.nan) for run in runs]
     value = sum(values) / len(values) if values else math.nan
     unscored = [f"{run.scene}: {run.skipped['psnr']}" for run in runs if "psnr" in run.skipped]
-    reason = "; ".join([*(failure.reason for failure in outcome.failures), *unscored])
+    reason = "; ".join([*reasons, *unscored])
     if not reason and not math.isfinite(value):
         reason = f"PSNR is {value}"
     for name, found in (
