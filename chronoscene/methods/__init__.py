@@ -24,6 +24,8 @@ from chronoscene.methods.interface import (
     TrainingSet,
     TrainingView,
     View,
+    has_function,
+    make_method,
 )
 from chronoscene.methods.options import (
     MethodConfig,
@@ -66,10 +68,12 @@ __all__ = [
     "build_config",
     "check_options",
     "config_from_values",
+    "has_function",
     "import_object",
     "installed_methods",
     "is_preset_file",
     "load_spec",
+    "make_method",
     "method_names",
     "options_of",
     "preset_name",

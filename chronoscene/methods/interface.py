@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, computed_field
 
 from chronoscene.methods.options import MethodConfig
+from chronoscene.methods.spec import MethodSpec, import_object
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.similarity import Sim3
 
@@ -309,3 +310,14 @@ class Method(Protocol):
         Args:
             train: Its views are of the new period alone, its periods are those so far.
         """
+
+
+def make_method(spec: MethodSpec, config: MethodConfig) -> Method:
+    """Make a method that has no model yet; imports its class."""
+    method: Method = import_object(spec.method)(config)
+    return method
+
+
+def has_function(spec: MethodSpec, name: str) -> bool:
+    """Return True if a method has this optional function of `Method`; another program has none."""
+    return spec.runner is None and hasattr(import_object(spec.method), name)

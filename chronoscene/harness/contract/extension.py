@@ -17,7 +17,7 @@ from chronoscene.harness.contract.subject import (
     same_files,
 )
 from chronoscene.harness.contract.training import below_a_constant_image
-from chronoscene.methods import Method, TrainingSet
+from chronoscene.methods import Method, TrainingSet, has_function
 
 
 def a_further_period_is_learned(subject: Subject) -> None:
@@ -25,9 +25,11 @@ def a_further_period_is_learned(subject: Subject) -> None:
 
     What it saves then is a model of all periods so far, and a training in between can be resumed.
     """
+    if not has_function(subject.spec, "extend"):
+        raise NotApplicableError("the method has no extend")
     hide = subject.spec.period_input == "none"
     first, second, third = (tiny_training.make_stage(i, hide_period=hide) for i in range(3))
-    method, between, folder = _begun(subject, first), subject.folder(), subject.folder()
+    method, between, folder = subject.begun(first), subject.folder(), subject.folder()
     go_on(method, 0)
     if subject.spec.resumable:
         method.save_training(between)
@@ -39,7 +41,7 @@ def a_further_period_is_learned(subject: Subject) -> None:
     below_a_constant_image(method, second)
     model = subject.save(method)
     if subject.spec.resumable:
-        again = _begun(subject, first)
+        again = subject.begun(first)
         again.load_training(between)
         again.extend(second)
         again.load_training(folder)
@@ -60,15 +62,6 @@ def a_further_period_is_learned(subject: Subject) -> None:
     loaded.load(saved, device="cpu")
     same = np.array_equal(_images(method, third), _images(loaded, third))
     demand(same, "Prediction.rgb after extend and load", "equal pixels")
-
-
-def _begun(subject: Subject, train: TrainingSet) -> Method:
-    """Return a method before its first step, if it can be extended."""
-    method = subject.fresh()
-    if not hasattr(method, "extend"):
-        raise NotApplicableError("the method has no extend")
-    method.setup(train, seed=0, device="cpu")
-    return method
 
 
 def _images(method: Method, train: TrainingSet) -> NDArray[np.float32]:

@@ -25,8 +25,8 @@ from chronoscene.methods import (
     StepReport,
     TrainingSet,
     View,
-    import_object,
     load_spec,
+    make_method,
 )
 
 PAUSE = 63
@@ -95,13 +95,12 @@ class Subject:
 
     def fresh(self) -> Method:
         """Return a method without a model."""
-        method: Method = import_object(self.spec.method)(tiny_training.small_config(self.spec))
-        return method
+        return make_method(self.spec, tiny_training.small_config(self.spec))
 
-    def begun(self) -> Method:
-        """Return a method before its first step."""
+    def begun(self, data: TrainingSet | None = None) -> Method:
+        """Return a method before its first step, with other data than `data` if given."""
         method = self.fresh()
-        method.setup(self.data, seed=0, device="cpu")
+        method.setup(data or self.data, seed=0, device="cpu")
         return method
 
     def loaded(self) -> Method:

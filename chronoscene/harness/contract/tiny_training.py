@@ -25,8 +25,8 @@ from chronoscene.methods import (
     StepReport,
     TrainingSet,
     build_config,
-    import_object,
     load_spec,
+    make_method,
 )
 from chronoscene.scene import Camera, Frame, Period, Points, Scene, Split
 
@@ -106,7 +106,7 @@ def train(
     """Train as the harness does; ``probe`` renders now and then in between."""
     set_threads(threads)
     seed_everything(seed)
-    method: Method = import_object(spec.method)(small_config(spec))
+    method = make_method(spec, small_config(spec))
     method.setup(data, seed=seed, device="cpu")
     reports = []
     for index in range(steps):

@@ -12,7 +12,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.formats import writable_formats
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.resolve import ResolvedRun
-from chronoscene.methods import MethodSpec, ProgramConfig, Runner, import_object
+from chronoscene.methods import ProgramConfig, Runner, has_function
 
 VALUES = ("data", "output", "work", "iterations", "seconds", "seed")
 """Values that a `Runner` may name besides the options of its config."""
@@ -69,11 +69,6 @@ def check_runner(run: ResolvedRun, runner: Runner) -> None:
     check_choice(f"{spec.name}: exports", runner.exports, writable_formats())
 
 
-def _has(spec: MethodSpec, function: str) -> bool:
-    """Return True if a method has an optional function of `Method`."""
-    return spec.runner is None and hasattr(import_object(spec.method), function)
-
-
 def check_stages(run: ResolvedRun) -> None:
     """Check that a method can be trained in stages.
 
@@ -81,7 +76,7 @@ def check_stages(run: ResolvedRun) -> None:
         ConfigError: If it cannot, or is to be trained further after the last one.
     """
     job, spec = run.job, run.spec
-    if not _has(spec, "extend"):
+    if not has_function(spec, "extend"):
         raise ConfigError(
             f"{spec.name} --strategy {job.strategy}",
             expected="a method that can be trained on one period after the other",
@@ -104,7 +99,7 @@ def check_fitting(run: ResolvedRun) -> None:
         ConfigError: If it cannot.
     """
     spec = run.spec
-    if not _has(spec, "fitted_to"):
+    if not has_function(spec, "fitted_to"):
         raise ConfigError(
             f"{spec.name} --fit-half",
             expected="a method whose appearance belongs to single photos",

@@ -18,7 +18,7 @@ from chronoscene.images.disk_cache import DiskCache, files_of
 from chronoscene.images.store import ImageStore, decoded_bytes, evaluation_size
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads, machine_memory, views_for_threads
-from chronoscene.methods import Method, MethodConfig, MethodSpec, import_object
+from chronoscene.methods import MethodConfig, MethodSpec, has_function, make_method
 from chronoscene.scene import Scene
 
 _DECODING = 20
@@ -168,11 +168,11 @@ def device_need(scene: Scene, needs: PhotoNeeds, spec: MethodSpec, config: Metho
         spec: The method.
         config: Its options.
     """
-    if not spec.method or not hasattr(import_object(spec.method), "device_memory"):
+    if not has_function(spec, "device_memory"):
         return ""
-    method: Method = import_object(spec.method)(config)
     periods = len(scene.periods) if spec.period_input != "none" else 1
-    count, parts = method.device_memory(len(scene.points.xyz), periods, needs.pixels)
+    method, points = make_method(spec, config), len(scene.points.xyz)
+    count, parts = method.device_memory(points, periods, needs.pixels)
     listed = ", ".join(f"{name} {_gb(size)}" for name, size in parts.items())
     return (
         f"{needs.scene}: {spec.name} takes about {_gb(sum(parts.values()))} of the GPU with "

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from chronoscene.harness.train.loop import Clock, seed_everything
 from chronoscene.harness.train.painted_balls import make_training_set
-from chronoscene.methods import Method, MethodConfig, MethodSpec, import_object
+from chronoscene.methods import MethodConfig, MethodSpec, make_method
 
 WARM_UP_STEPS = 120  # Enough for the first rounds of densification of the methods here
 WARM_UP_SECONDS = 3.0  # Limit on the time for the steps after the first three
@@ -28,7 +28,7 @@ def warm_up(
     """
     try:
         seed_everything(0)
-        method: Method = import_object(spec.method)(config)
+        method = make_method(spec, config)
         train = make_training_set(num_periods)
         method.setup(train, seed=0, device=device)
         started = now()

@@ -56,7 +56,7 @@ from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.kernels.runtime import check_device, keep_freed_memory, set_threads
-from chronoscene.methods import Method, MethodSize, MethodSpec, PeriodSharing, import_object
+from chronoscene.methods import Method, MethodSize, MethodSpec, PeriodSharing, make_method
 from chronoscene.scene import Frame, Scene
 
 NOTHING_SHARED = "nothing in the model that periods have of their own and could share"
@@ -110,7 +110,7 @@ def run_job(job: Job, report: Report | None = None) -> None:
     stages = [part.name for part in parts[:-1]] if STRATEGIES[job.strategy].in_order else []
     writers = {name: ImageWriter(staging / records.STAGES / name) for name in stages}
     final = ImageWriter(staging / records.PREDICTIONS)
-    method, outcomes = _new_method(run), []
+    method, outcomes = make_method(run.spec, run.config), []
     with ProgressDisplay(job.label, report=report, models=len(parts)) as display:
         display.wait("warm-up: seconds, or minutes where kernels are not compiled yet")
         before = time.perf_counter()
@@ -124,7 +124,7 @@ def run_job(job: Job, report: Report | None = None) -> None:
         for part, stop in zip(parts, run.stops(parts), strict=True):
             display.begin(part.name, stop)
             if not part.extends:
-                method = _new_method(run)
+                method = make_method(run.spec, run.config)
             checkpoints = None
             if run.spec.resumable:
                 checkpoints = _checkpoints(run, part, len(parts), display)
@@ -164,17 +164,11 @@ def pick_device(wanted: str, spec: MethodSpec) -> str:
     return "cpu"
 
 
-def _new_method(run: ResolvedRun) -> Method:
-    """Make an empty method."""
-    method: Method = import_object(run.spec.method)(run.config)
-    return method
-
-
 def _render_untrained(
     run: ResolvedRun, parts: Sequence[Part], machine: Machine, writer: ImageWriter
 ) -> None:
     """Render what the first stage does not learn, with the model that it begins with."""
-    method, first = _new_method(run), parts[0]
+    method, first = make_method(run.spec, run.config), parts[0]
     seed_everything(run.job.seed)
     method.setup(first.train, seed=run.job.seed, device=machine.device)
     for part in parts:
@@ -242,7 +236,7 @@ def _run_part(
     display.wait(f"{len(part.test)} test views")
     saved = _save(method, checkpoint, part)
     # What is scored is what the checkpoint holds, and nothing that only the training knows.
-    loaded = _new_method(run)
+    loaded = make_method(run.spec, run.config)
     loaded.load(saved, device=machine.device)
     for frame in part.test[:1]:
         loaded.render(part.view(frame), part.method_period(frame))  # the first time takes longer

@@ -33,8 +33,8 @@ from chronoscene.methods import (
     Prediction,
     View,
     config_from_values,
-    import_object,
     load_spec,
+    make_method,
 )
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
@@ -165,7 +165,7 @@ class TrainedRun:
                 found="no such folder",
                 todo="copy it there, or delete the run and run bench again",
             )
-        method: Method = import_object(self.spec.method)(self.config)
+        method = make_method(self.spec, self.config)
         method.load(folder, device=self.device)
         return method
 
