@@ -6,3 +6,5 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Pixels = NDArray[np.uint8]
+"""An image in 8 bits, RGB or grey."""

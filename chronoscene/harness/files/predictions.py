@@ -14,9 +14,10 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
+from chronoscene.arrays import Mask, Pixels
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files.records import RunRecord, damaged, read_document
 from chronoscene.io.staging import replacing, write_text_atomic
@@ -107,7 +108,7 @@ def image_file(view: str) -> str:
     return f"{_inside(safe_name(view))}.png"
 
 
-def to_bytes(rgb: ArrayLike) -> NDArray[np.uint8]:
+def to_bytes(rgb: ArrayLike) -> Pixels:
     """Quantise 0..1 to 0..255 by rounding; values outside are clipped. [H, W, 3]"""
     image = np.asarray(rgb)
     if image.dtype == np.uint8:
@@ -115,7 +116,7 @@ def to_bytes(rgb: ArrayLike) -> NDArray[np.uint8]:
     return np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def encode_png(image: NDArray[np.uint8]) -> bytes:
+def encode_png(image: Pixels) -> bytes:
     """Encode an RGB image [H, W, 3], or a grey one [H, W], as PNG."""
     import cv2
 
@@ -126,12 +127,12 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
-def to_grey(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def to_grey(mask: Mask) -> Pixels:
     """Make an image of a mask: 255 where it is true. [H, W]"""
     return 255 * mask.astype(np.uint8)
 
 
-def write_png(folder: Path, file: str, pixels: NDArray[np.uint8]) -> str:
+def write_png(folder: Path, file: str, pixels: Pixels) -> str:
     """Write one PNG file below a folder; returns its SHA-256."""
     target, data = folder / file, encode_png(pixels)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -155,7 +156,7 @@ class ImageWriter:
         *,
         camera_period: int,
         rendered_period: int,
-        mask: NDArray[np.bool_] | None = None,
+        mask: Mask | None = None,
     ) -> None:
         """Write one image: uint8, or floats 0..1 [H, W, 3], and where it counts [H, W]."""
         pixels, file = to_bytes(image), image_file(view)
@@ -222,7 +223,7 @@ def read_manifest(folder: Path) -> Manifest:
     return read_document(folder / MANIFEST, Manifest, expected="a manifest of images")
 
 
-def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
+def load_image(folder: Path, entry: ImageEntry) -> Pixels:
     """Read one image. [H, W, 3]
 
     Raises:
@@ -232,19 +233,19 @@ def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image[..., ::-1])
 
 
-def load_mask(folder: Path, entry: ImageEntry) -> NDArray[np.bool_] | None:
+def load_mask(folder: Path, entry: ImageEntry) -> Mask | None:
     """Read the mask of the pixels that count; None if all do. Errors as for `load_image`. [H, W]"""
     return _load_grey(folder, entry, entry.mask_file, entry.mask_sha256)
 
 
-def load_changed(folder: Path, entry: ImageEntry) -> NDArray[np.bool_] | None:
+def load_changed(folder: Path, entry: ImageEntry) -> Mask | None:
     """Read the mask of changes between periods; None if unknown. Otherwise as `load_mask`."""
     return _load_grey(folder, entry, entry.changed_file, entry.changed_sha256)
 
 
 def _load_grey(
     folder: Path, entry: ImageEntry, file: str | None, sha256: str | None
-) -> NDArray[np.bool_] | None:
+) -> Mask | None:
     if file is None or sha256 is None:
         return None
     size = entry.height, entry.width
@@ -253,7 +254,7 @@ def _load_grey(
 
 def _load_png(
     folder: Path, file: str, sha256: str, size: tuple[int, int], *, color: bool
-) -> NDArray[np.uint8]:
+) -> Pixels:
     """Decode one listed file; channels are in OpenCV's order."""
     import cv2
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Mask
 from chronoscene.checks import check_choice
 from chronoscene.errors import SceneError
 from chronoscene.harness.files.strategies import STRATEGIES, period_part
@@ -180,7 +180,7 @@ def training_frame(scene: Scene, periods: range | None = None) -> Sim3:
     return Sim3(scale, np.eye(3), -scale * centre)
 
 
-def _median_depth(frames: Sequence[Frame], xyz: NDArray[np.float64]) -> float:
+def _median_depth(frames: Sequence[Frame], xyz: Array) -> float:
     """Return the median over images of the median depth of the points in them; 0 without any.
 
     Of many images and points, some that are evenly chosen.
@@ -211,7 +211,7 @@ def _training_frames(scene: Scene, periods: range) -> tuple[Frame, ...]:
     return frames
 
 
-def _seen(scene: Scene, periods: range) -> NDArray[np.bool_]:
+def _seen(scene: Scene, periods: range) -> Mask:
     """Return True where a training image of one of these periods sees the point. [P, T]
 
     Points of other sources than COLMAP, such as laser scans, have no tracks: if that is true of
@@ -223,7 +223,7 @@ def _seen(scene: Scene, periods: range) -> NDArray[np.bool_]:
     return scene.point_periods(np.array(counts))
 
 
-def _centres(frames: Sequence[Frame]) -> NDArray[np.float64]:
+def _centres(frames: Sequence[Frame]) -> Array:
     return camera_centre(np.stack([f.cam_from_world for f in frames]))
 
 

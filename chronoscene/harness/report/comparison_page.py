@@ -6,10 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from chronoscene import __version__
+from chronoscene.arrays import Pixels
 from chronoscene.harness.files.ground_truth import truth_of
 from chronoscene.harness.files.predictions import ImageEntry, load_image, read_manifest
 from chronoscene.harness.files.records import Failure, RunRecord
@@ -128,7 +126,7 @@ def _shown_view(
     return ShownView(entry.view, period, _picture(photo), tuple(predictions))
 
 
-def _picture(pixels: NDArray[np.uint8]) -> str:
+def _picture(pixels: Pixels) -> str:
     from PIL import Image
 
     picture = Image.fromarray(pixels)

@@ -16,11 +16,11 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from chronoscene.arrays import Array
 from chronoscene.harness.report.intervals import LEVEL, REPLICATES, SEED
 
-Floats = NDArray[np.float64]
 TINY = np.finfo(float).tiny
 FLOOR = 1e-6
 """Least estimate of a variance by a few draws, as a share of the true one."""
@@ -29,7 +29,7 @@ FLOOR = 1e-6
 class SeedSpread(NamedTuple):
     """Spread of single runs over seeds."""
 
-    variances: Floats
+    variances: Array
     """Variance of each method; NaN if none has two seeds. [M]"""
     freedom: int
     """Seeds beyond the first of each method."""
@@ -47,7 +47,7 @@ def seed_spread(sds: ArrayLike, ns: ArrayLike) -> SeedSpread:
     return SeedSpread(np.fmax(squares, pooled), freedom)
 
 
-def explained_by_seeds(spread: SeedSpread, ns: ArrayLike) -> Floats:
+def explained_by_seeds(spread: SeedSpread, ns: ArrayLike) -> Array:
     """Compute differences to the first method that seeds alone explain at 95 %, by a t-test.
 
     Args:
@@ -64,14 +64,14 @@ def explained_by_seeds(spread: SeedSpread, ns: ArrayLike) -> Floats:
 
 
 def margins(
-    means: Floats,
-    resampled: Floats,
+    means: Array,
+    resampled: Array,
     freedom: float,
     spread: SeedSpread,
     ns: ArrayLike,
     *,
     chosen: bool,
-) -> Floats:
+) -> Array:
     """Compute half the widths of the 95 % intervals of differences to the first method.
 
     Args:
@@ -109,7 +109,7 @@ def margins(
         near[1:] = ~apart
 
 
-def _studentised(errors: Floats, freedom: float) -> tuple[Floats, Floats]:
+def _studentised(errors: Array, freedom: float) -> tuple[Array, Array]:
     """Divide errors by their standard deviation as few values estimate it, times the true one.
 
     Args:

@@ -14,8 +14,9 @@ from functools import lru_cache
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from chronoscene.arrays import Array
 from chronoscene.formats.shared.grouping import natural_key
 
 LEVEL = 0.95
@@ -37,7 +38,7 @@ def block_length(n: int) -> int:
     return max(1, round(math.sqrt(n)))
 
 
-def resampled_means(values: Mapping[str, float], stratum: str) -> NDArray[np.float64]:
+def resampled_means(values: Mapping[str, float], stratum: str) -> Array:
     """Compute means of resampled views. [REPLICATES]
 
     The draws depend on ``stratum`` and the names of the views alone.
@@ -58,7 +59,7 @@ def resampled_means(values: Mapping[str, float], stratum: str) -> NDArray[np.flo
 
 
 @lru_cache(maxsize=64)
-def resampling_weights(n: int, stream: int) -> NDArray[np.float64]:
+def resampling_weights(n: int, stream: int) -> Array:
     """Compute the weights of views in resampled means of a path; those of a mean add up to 1.
 
     Circular blocks (Politis & Romano 1992) of `block_length` views, n together. Such means vary too
@@ -80,7 +81,7 @@ def resampling_weights(n: int, stream: int) -> NDArray[np.float64]:
     return (shares - 1 / n) * math.sqrt(alike.mean() / found) + 1 / n
 
 
-def _correlations(n: int) -> NDArray[np.float64]:
+def _correlations(n: int) -> Array:
     """Return the correlations of the views of a path that weights make up for. [n, n]"""
     return CORRELATION ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
 
@@ -115,9 +116,7 @@ def pooled_freedom(counts: Iterable[int], weights: Iterable[float] | None = None
     return math.fsum(variances) ** 2 / spread if counts else math.nan
 
 
-def interval(
-    resampled: NDArray[np.float64], freedom: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def interval(resampled: Array, freedom: ArrayLike) -> tuple[Array, Array]:
     """Compute the ends of percentile intervals, wider by what t has over the normal distribution.
 
     Args:

@@ -10,8 +10,8 @@ from statistics import mean
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.harness.files.records import CURVE_FILE, CurvePoint, RunRecord, read_lines
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.report.comparable import several_scenes
@@ -27,7 +27,7 @@ LADDER = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 18000, 360
 MAX_LEVELS = 7
 """PSNR levels whose times are asked for, at most."""
 
-Curve = NDArray[np.float64]
+Curve = Array
 """Seconds and PSNR of the probes of a run. [2, K]"""
 
 

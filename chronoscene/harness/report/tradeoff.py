@@ -9,8 +9,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Mask
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.command_line import command_line
 from chronoscene.harness.files.records import RunRecord
@@ -132,9 +132,7 @@ def _panel(entries: DataFrame, device: str, metric: str, cost: str) -> DataFrame
     return both[[*FRONT_COLUMNS]]
 
 
-def on_front(
-    costs: NDArray[np.float64], quality: NDArray[np.float64], tolerance: float = 0.0
-) -> NDArray[np.bool_]:
+def on_front(costs: Array, quality: Array, tolerance: float = 0.0) -> Mask:
     """Find the points to which no other one is as good for less, or better for as much. [N]
 
     Args:

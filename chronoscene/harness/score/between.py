@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
+from chronoscene.arrays import Array, Mask, Pixels
 
 FRACTIONS = (0.25, 0.5, 0.75)
 """Times in between, 0 at the first date and 1 at the second."""
@@ -36,7 +35,7 @@ class BetweenScore:
     """RMS distance between the two dates themselves, over the same pixels."""
 
     @classmethod
-    def of(cls, sums: NDArray[np.float64], pixels: int) -> BetweenScore | None:
+    def of(cls, sums: Array, pixels: int) -> BetweenScore | None:
         """Make the score from the sums of `squared_distances` over views; None without pixels."""
         if pixels == 0:
             return None
@@ -54,7 +53,7 @@ class MethodBetween:
     """A method between two dates: its images of one camera, and its score over all views."""
 
     title: str
-    images: tuple[Image | None, ...]
+    images: tuple[Pixels | None, ...]
     """At the first date, at `FRACTIONS` and at the second; None for what it cannot render."""
     score: BetweenScore | None
     """None if it knows no periods in between, or no pixel changes."""
@@ -70,7 +69,7 @@ class SceneBetween:
     """Labels of periods by their ids."""
     view: str
     """View whose camera is shown."""
-    truths: tuple[Image | None, Image | None]
+    truths: tuple[Pixels | None, Pixels | None]
     """Photo of this camera and what it would have seen at the other date; None where unknown."""
     methods: tuple[MethodBetween, ...]
     pixels: int
@@ -79,13 +78,13 @@ class SceneBetween:
     """True if they are those of change masks of the scene; else the renders tell."""
 
 
-def color_distance(a: Image, b: Image) -> NDArray[np.float64]:
+def color_distance(a: Pixels, b: Pixels) -> Array:
     """Norm of the difference of colours per pixel; 1 between black and white. [H, W]"""
     difference = (a.astype(np.float64) - b) / 255.0
     return np.sqrt((difference**2).mean(axis=2))
 
 
-def squared_distances(images: Sequence[Image], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+def squared_distances(images: Sequence[Pixels], mask: Mask) -> Array:
     """Sum squared distances of colours over the changing pixels of a view.
 
     Args:

@@ -20,8 +20,8 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.harness.files.records import UNTRAINED, Values
 from chronoscene.harness.files.strategies import period_part
 from chronoscene.metrics.registry import all_metrics
@@ -30,7 +30,7 @@ Stages = Mapping[str, Mapping[str, Values]]
 """Stage to period id to metric to value, as `RunRecord.stages`."""
 
 
-def stage_matrix(stages: Stages, metric: str) -> NDArray[np.float64]:
+def stage_matrix(stages: Stages, metric: str) -> Array:
     """Return b as row 0 and R[k] as row k + 1; NaN where nothing was rendered. [T + 1, T]"""
     periods = range(len(stages) - 1)
     names = [UNTRAINED, *map(period_part, periods)]

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask, Pixels
 from chronoscene.errors import CheckpointError, ChronoSceneError, MetricUnavailableError, ShapeError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import ImageEntry, Manifest, load_image, read_manifest
@@ -152,10 +152,7 @@ def score_job(job: Job, record: RunRecord) -> None:
 
 
 def score_pair(
-    image: NDArray[np.uint8],
-    reference: NDArray[np.uint8],
-    scorers: Scorers,
-    mask: NDArray[np.bool_] | None = None,
+    image: Pixels, reference: Pixels, scorers: Scorers, mask: Mask | None = None
 ) -> tuple[Values, dict[str, str]]:
     """Compute the values of one view, and reasons where its size or mask does not allow them.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask
 from chronoscene.harness.files.predictions import load_image, read_manifest
 from chronoscene.harness.score.regions import scored_mask
 from chronoscene.harness.score.scoring import match_views
@@ -25,7 +26,7 @@ class PredictedView:
     """[H, W, 3]"""
     truth: NDArray[np.float32]
     """[H, W, 3]"""
-    mask: NDArray[np.bool_] | None
+    mask: Mask | None
     """True where the photo is scored; None if all of it is. [H, W]"""
 
 

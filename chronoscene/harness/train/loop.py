@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask, Pixels
 from chronoscene.errors import ChronoSceneError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.files.records import CurvePoint
@@ -96,7 +96,7 @@ class PauseDetector:
         return paused
 
 
-Truth = Mapping[str, tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]
+Truth = Mapping[str, tuple[Pixels, Mask | None]]
 """Photos by name [H, W, 3], with masks that are true where they count [H, W], or None. Photos that
 count nowhere are left out."""
 
@@ -294,7 +294,7 @@ def _probe(method: Method, part: Part, truth: Truth, state: LoopState) -> tuple[
     return point, blank and mean < BLANK_PSNR
 
 
-def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:
+def render_bytes(method: Method, part: Part, frame: Frame) -> Pixels:
     """Render a frame at its own period, quantised to 8 bits. [H, W, 3]
 
     Raises:
@@ -304,7 +304,7 @@ def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:
     return checked_bytes(prediction, part, frame)
 
 
-def checked_bytes(prediction: Prediction, part: Part, frame: Frame) -> NDArray[np.uint8]:
+def checked_bytes(prediction: Prediction, part: Part, frame: Frame) -> Pixels:
     """Quantise the image of a prediction to 8 bits; errors as in `render_bytes`. [H, W, 3]"""
     check_prediction(prediction, part.view(frame), f"model {part.name}, view {frame.name}")
     return to_bytes(prediction.rgb)

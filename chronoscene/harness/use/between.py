@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask, Pixels
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.score.between import (
     FRACTIONS,
     BetweenScore,
-    Image,
     MethodBetween,
     SceneBetween,
     color_distance,
@@ -72,7 +71,7 @@ def measure_between(
     frames = [frame for frame in scene.select(split="test") if frame.period in dates]
     changes = _true_changes(scene.root / "gt", store, frames, dates, max_width)
     sums, pixels = np.zeros((len(runs), len(FRACTIONS) + 1)), 0
-    shown: list[list[Image]] = []
+    shown: list[list[Pixels]] = []
     for number, frame in enumerate(frames):
         progress(number, len(frames))
         wanted = [run.is_continuous or frame.name == view for run in runs]
@@ -115,7 +114,7 @@ def times(run: TrainedRun, dates: tuple[int, int]) -> tuple[float, ...]:
     return first, *middle, last
 
 
-def _render(run: TrainedRun, store: ImageStore, frame: Frame, time: float) -> Image:
+def _render(run: TrainedRun, store: ImageStore, frame: Frame, time: float) -> Pixels:
     return to_bytes(run.render(store.camera(frame), frame.cam_from_world, time).rgb)
 
 
@@ -125,7 +124,7 @@ def _other(frame: Frame, dates: tuple[int, int]) -> int:
 
 def _true_changes(
     truth: Path, store: ImageStore, frames: Sequence[Frame], dates: tuple[int, int], max_width: int
-) -> list[NDArray[np.bool_]]:
+) -> list[Mask]:
     """Read where views change between the dates; empty if it is not known of all."""
     paths = [truth / truth_place("change", frame.name, _other(frame, dates)) for frame in frames]
     if not all(path.is_file() for path in paths):
@@ -136,7 +135,7 @@ def _true_changes(
     ]
 
 
-def _rendered_changes(images: Sequence[Sequence[Image]]) -> NDArray[np.bool_]:
+def _rendered_changes(images: Sequence[Sequence[Pixels]]) -> Mask:
     """Find where methods, on average, show a difference; the same pixels for all of them. [H, W]"""
     if not images:
         return np.zeros((1, 1), bool)
@@ -146,7 +145,7 @@ def _rendered_changes(images: Sequence[Sequence[Image]]) -> NDArray[np.bool_]:
 
 def _truths(
     scene: Scene, store: ImageStore, frame: Frame, dates: tuple[int, int]
-) -> tuple[Image | None, Image | None]:
+) -> tuple[Pixels | None, Pixels | None]:
     size = store.camera(frame).size
     other = load_other(scene.root / "gt", frame.name, _other(frame, dates), size)
     photo = store.load(frame)

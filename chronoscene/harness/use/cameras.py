@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.colmap.model import read_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats.shared import transforms
@@ -41,7 +41,7 @@ class Viewpoint:
     """File name of the picture, with its folders and extension."""
     camera: Camera
     """Without distortion, at the size to render."""
-    cam_from_world: NDArray[np.float64]
+    cam_from_world: Array
     """In the world of the scene. [4, 4]"""
     period: float | None
     """None if the source of the camera has none."""

@@ -6,9 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Pixels
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.cameras import Viewpoint
@@ -110,7 +109,7 @@ def score_map(
         a truth.
     """
     scores: list[Array] = []
-    masks: list[NDArray[np.uint8]] = []
+    masks: list[Pixels] = []
     for frame in scene.select(split="test"):
         other = sum(made.periods) - frame.period
         path = scene.root / "gt" / truth_place("change", frame.name, other)

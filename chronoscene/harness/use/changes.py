@@ -22,17 +22,15 @@ from functools import cached_property
 from itertools import combinations, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.errors import ConfigError
 from chronoscene.harness.use.cameras import Viewpoint
 from chronoscene.methods import Prediction
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import project_points, unproject_pixels
 
-Mask = NDArray[np.bool_]
 Render = Callable[[Camera, Array, float], Prediction]
 """Render a camera with a pose at a period, as `TrainedRun.render`."""
 
@@ -74,7 +72,7 @@ class ChangeMap:
     """Score of change, 0 or more; 0 where unknown or where geometry has changed. [N]"""
 
     @cached_property
-    def classes(self) -> NDArray[np.int64]:
+    def classes(self) -> Ints:
         """Index into `CLASSES`. [N]"""
         kinds = [~self.known, self.geometry >= GEOMETRY, self.appearance >= APPEARANCE]
         return np.select(kinds, [1, np.where(self.later, 4, 3), 2], 0)

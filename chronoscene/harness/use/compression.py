@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
+from chronoscene.arrays import Array
 from chronoscene.compression.columns import Columns
 from chronoscene.compression.file import COMPRESSED_FILE, META_FILE, TENSOR_FILE, encode
 from chronoscene.compression.positions import Grid, morton
@@ -252,9 +253,7 @@ def _fit(model: _SortedModel, max_loss: float, log: Log) -> dict[str, Columns]:
     return at(start * 2**low)
 
 
-def _sensitivity(
-    model: _SortedModel, rules: Mapping[str, Columns], log: Log
-) -> dict[str, NDArray[np.float64]]:
+def _sensitivity(model: _SortedModel, rules: Mapping[str, Columns], log: Log) -> dict[str, Array]:
     """Measure k_c of every column, by rounding one after the other."""
     frames = spread_frames(model.frames, PROBE_VIEWS)
     plain = model.images(model.tensors, frames, model.small)

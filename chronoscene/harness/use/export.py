@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chronoscene import __version__, splat_files
 from chronoscene.arrays import Array
@@ -52,7 +51,7 @@ class Prepared:
 
     cloud: GaussianCloud
     """In the frame of the scene minus `offset`."""
-    offset: NDArray[np.float64]
+    offset: Array
     """Position in the scene minus position in the file. [3]"""
     antialiased: bool
     """True if viewers have to use the antialiasing filter."""
@@ -141,7 +140,7 @@ def period_files(labels: Mapping[str, str], kind: str) -> dict[int, str]:
     return {int(k): f"{safe_part(name)}{suffix}" for k, name in names.items()}
 
 
-def local_offset(scene: Scene) -> NDArray[np.float64]:
+def local_offset(scene: Scene) -> Array:
     """Return what is subtracted from coordinates that are too large for files, else 0. [3]
 
     It is the same for all periods: the median camera centre, in whole units.
@@ -262,7 +261,7 @@ def _lost(model: float, file: float) -> str:
     return f"{round(model - file, 2) + 0.0:.2f}"  # never -0.00
 
 
-def _describe_offset(scene: Scene, offset: NDArray[np.float64]) -> str:
+def _describe_offset(scene: Scene, offset: Array) -> str:
     text = "Add {:.0f} {:.0f} {:.0f} to coordinates of this file for those".format(*offset)
     if scene.world.crs is None:
         return f"{text} of the scene"

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask, Pixels
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.files.records import ViewScore
 from chronoscene.harness.score.regions import ALL, CHANGED, INVARIANT
@@ -25,8 +26,6 @@ from chronoscene.metrics.depth import depth_errors
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame, Scene
 
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Key = tuple[str, str]
 """Region and metric."""
 
@@ -99,7 +98,7 @@ def depth_values(
 
 
 def pair_values(
-    own: Image, other: Image, photo: Image, truth: Image | None, changes: Image, counted: Mask
+    own: Pixels, other: Pixels, photo: Pixels, truth: Pixels | None, changes: Pixels, counted: Mask
 ) -> dict[Key, float]:
     """Compare the renders of one camera at two periods.
 

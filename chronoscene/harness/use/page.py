@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Pixels
 from chronoscene.errors import ConfigError
 from chronoscene.harness.use.page_gaussians import PackedGaussians, Reduction, fit_gaussians
 from chronoscene.harness.use.trained_run import TrainedRun
@@ -293,7 +292,7 @@ class _Photos:
             self.size += len(data)
 
 
-def _jpeg(pixels: NDArray[np.uint8]) -> bytes:
+def _jpeg(pixels: Pixels) -> bytes:
     from PIL import Image
 
     picture, file = Image.fromarray(pixels), io.BytesIO()

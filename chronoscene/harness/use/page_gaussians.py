@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask
 from chronoscene.errors import ConfigError
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.splat_files.spz import encode_plain
@@ -153,7 +153,7 @@ def pack(clouds: Sequence[GaussianCloud], *, antialiased: bool) -> PackedGaussia
     )
 
 
-def unite(clouds: Sequence[GaussianCloud]) -> tuple[GaussianCloud, NDArray[np.bool_]]:
+def unite(clouds: Sequence[GaussianCloud]) -> tuple[GaussianCloud, Mask]:
     """Unite the Gaussians of all periods, each of those that are equal once.
 
     Returns:
@@ -177,7 +177,7 @@ def unite(clouds: Sequence[GaussianCloud]) -> tuple[GaussianCloud, NDArray[np.bo
     return GaussianCloud(means, quats, scales, opacities[:, 0], sh.reshape(-1, 16, 3)), members
 
 
-def _without_repeated_centres(raw: bytes, count: int) -> tuple[bytes, NDArray[np.bool_]]:
+def _without_repeated_centres(raw: bytes, count: int) -> tuple[bytes, Mask]:
     """Drop centres of plain SPZ that equal the one before; say which. [N]"""
     end = HEADER_BYTES + CENTRE_BYTES * count
     centres = np.frombuffer(raw[HEADER_BYTES:end], np.uint8).reshape(count, CENTRE_BYTES)
@@ -197,7 +197,7 @@ def _reduced(cloud: GaussianCloud, reduction: Reduction) -> GaussianCloud:
     return kept
 
 
-def _bits(flags: NDArray[np.bool_]) -> str:
+def _bits(flags: Mask) -> str:
     return _base64(gzip.compress(np.packbits(flags).tobytes(), mtime=0))
 
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from chronoscene.arrays import Pixels
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import encode_png, to_bytes
 from chronoscene.harness.use.cameras import Viewpoint
@@ -56,7 +54,7 @@ def is_animation(out: Path) -> bool:
 
 def render_viewpoints(
     run: TrainedRun, viewpoints: Sequence[Viewpoint], *, appearance_period: float | None = None
-) -> Iterator[NDArray[np.uint8]]:
+) -> Iterator[Pixels]:
     """Yield one picture after the other. [H, W, 3]"""
     for viewpoint in viewpoints:
         assert viewpoint.period is not None
@@ -70,7 +68,7 @@ def render_viewpoints(
 
 
 def write_pictures(
-    out: Path, names: Iterable[str], images: Iterable[NDArray[np.uint8]], *, fps: float
+    out: Path, names: Iterable[str], images: Iterable[Pixels], *, fps: float
 ) -> None:
     """Write pictures to a file of `animation.SUFFIXES`, or to a new folder under their names.
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from chronoscene.arrays import Array
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.provenance import scene_hash
@@ -173,7 +174,7 @@ class TrainedRun:
         """Return the period as input of a model: 0 where the period is no input."""
         return float(period) if self.uses_period else 0.0
 
-    def view(self, camera: Camera, cam_from_world: NDArray[np.float64]) -> View:
+    def view(self, camera: Camera, cam_from_world: Array) -> View:
         """Return a camera with its pose [4, 4] in the training frame.
 
         Raises:
@@ -197,7 +198,7 @@ class TrainedRun:
     def render(
         self,
         camera: Camera,
-        cam_from_world: NDArray[np.float64],
+        cam_from_world: Array,
         period: float,
         *,
         appearance_period: float | None = None,

@@ -8,9 +8,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Pixels
 from chronoscene.errors import ChronoSceneError
 from chronoscene.figures.canvas import period_colors, rgb_of
 from chronoscene.figures.change_map import COLORS
@@ -67,9 +66,7 @@ class Layers:
             colors = self._content.scene.points.rgb[numbers]
         return self._add_cloud(f"/points/{period}", cloud.xyz[numbers], colors)
 
-    def _add_cloud(
-        self, name: str, xyz: Array, colors: NDArray[np.uint8]
-    ) -> viser.PointCloudHandle:
+    def _add_cloud(self, name: str, xyz: Array, colors: Pixels) -> viser.PointCloudHandle:
         return self._client.scene.add_point_cloud(
             name,
             self._content.view_from_world.apply(xyz).astype(np.float32),

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Pixels
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.changes import surface_depth
 from chronoscene.harness.use.trained_run import TrainedRun
@@ -33,7 +33,7 @@ class Side:
 
 def draw_picture(
     view: KeyView, size: tuple[int, int], sides: Sequence[Side], pixels: int, wipe: float = 0.5
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float32], Array]:
     """Draw a picture.
 
     Args:
@@ -66,7 +66,7 @@ def draw_picture(
     return rgb, np.concatenate([surface_depth(each) for each in shown], axis=1)
 
 
-def color_depth(depth: NDArray[np.float64]) -> NDArray[np.uint8]:
+def color_depth(depth: Array) -> Pixels:
     """Colour a depth map, near places light; black where there is no surface. [H, W, 3]"""
     inverse = 1 / depth
     surface = inverse > 0

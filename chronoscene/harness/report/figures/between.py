@@ -8,12 +8,13 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
+from chronoscene.arrays import Pixels
 from chronoscene.figures import canvas
 from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.records import FIGURES
 from chronoscene.harness.report.figures.comparison import CELL_WIDTH
 from chronoscene.harness.report.tables import period_name
-from chronoscene.harness.score.between import FRACTIONS, Image, MethodBetween, SceneBetween
+from chronoscene.harness.score.between import FRACTIONS, MethodBetween, SceneBetween
 from chronoscene.io.tables import Table, csv_text
 
 CSV_COLUMNS = (
@@ -27,7 +28,7 @@ TRUTH = "ground truth"  # Title of the first row
 def draw_between(runs: Path, found: SceneBetween) -> Path:
     """Draw one camera between two dates, a row for each method; returns the file."""
     first, last = found.dates
-    rows: list[tuple[str, Sequence[Image | None]]] = [
+    rows: list[tuple[str, Sequence[Pixels | None]]] = [
         (TRUTH, (found.truths[0], *[None] * len(FRACTIONS), found.truths[1])),
         *((_row_title(method), method.images) for method in found.methods),
     ]

@@ -9,8 +9,8 @@ from textwrap import shorten
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Mask, Pixels
 from chronoscene.figures import canvas
 from chronoscene.harness.files.ground_truth import truth_of
 from chronoscene.harness.files.predictions import ImageEntry, load_image, read_manifest, safe_part
@@ -181,7 +181,7 @@ def _frame(window: tuple[slice, slice]) -> Any:
     return Rectangle(corner, right - left, bottom - top, fill=False, edgecolor=FRAME, linewidth=1)
 
 
-def where_methods_differ(errors: Sequence[NDArray[np.float64]]) -> tuple[slice, slice]:
+def where_methods_differ(errors: Sequence[Array]) -> tuple[slice, slice]:
     """Find the window, `WINDOW` wide and high, that shows most: its rows and columns.
 
     It has the largest sum of the variance of the error between methods, pixel by pixel; with one
@@ -201,18 +201,14 @@ def where_methods_differ(errors: Sequence[NDArray[np.float64]]) -> tuple[slice, 
     return slice(y, y + h), slice(x, x + w)
 
 
-def psnr_text(
-    image: NDArray[np.uint8], photo: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-) -> str:
+def psnr_text(image: Pixels, photo: Pixels, mask: Mask | None) -> str:
     """Format the PSNR of a view; not scored where the mask ignores all of it."""
     if mask is not None and not mask.any():
         return "not scored"
     return f"{psnr(image, photo, mask):.2f} dB"
 
 
-def mean_error(
-    image: NDArray[np.uint8], photo: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
-) -> NDArray[np.float64]:
+def mean_error(image: Pixels, photo: Pixels, mask: Mask | None = None) -> Array:
     """Average the absolute error over channels, 0..1; NaN where the mask ignores. [H, W]"""
     difference = image.astype(np.float64) - photo.astype(np.float64)
     error = np.abs(difference).mean(axis=2) / 255.0

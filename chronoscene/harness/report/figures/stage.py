@@ -8,8 +8,8 @@ from textwrap import fill, shorten
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.figures import canvas
 from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.records import FIGURES, RunRecord
@@ -70,11 +70,7 @@ def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]], metrics: Seq
 
 
 def _draw_matrix(
-    axis: Any,
-    values: NDArray[np.float64],
-    found: Sequence[NDArray[np.float64]],
-    names: Sequence[str],
-    metric: MetricInfo,
+    axis: Any, values: Array, found: Sequence[Array], names: Sequence[str], metric: MetricInfo
 ) -> Any:
     """Draw one heat map, in colours for the trained models of all those ``found``."""
     known = np.concatenate([matrix[1:][np.isfinite(matrix[1:])] for matrix in found])
