@@ -24,18 +24,15 @@ KEY = (
     *("config_hash", "max_width", "device"),
 )
 """Fields of `RunRecord` in which the seeds of a configuration agree on one device."""
-_FIELDS = {
-    "width": "max_width", "protocol": "protocol", "fitted": "fitted",
-    "split": "split_hash", "scene": "scene_hash",
-}  # fmt: skip
-_MEANING = {
-    "width": "--max-width",
-    "protocol": "--protocol",
-    "fitted": "--fit-half",
-    "split": "test views",
-    "scene": "photos, poses or points",
+_DIFFERENCES = {
+    "width": ("max_width", "--max-width"),
+    "protocol": ("protocol", "--protocol"),
+    "fitted": ("fitted", "--fit-half"),
+    "split": ("split_hash", "test views"),
+    "scene": ("scene_hash", "photos, poses or points"),
 }
-_APART = re.compile(rf" \[(?:{'|'.join(_FIELDS)}) [^]]*\]")
+"""Kinds of differences between tests of a scene: field of `RunRecord`, and meaning for users."""
+_APART = re.compile(rf" \[(?:{'|'.join(_DIFFERENCES)}) [^]]*\]")
 
 
 class Setting(NamedTuple):
@@ -102,17 +99,17 @@ def apart(records: Sequence[RunRecord]) -> list[RunRecord]:
         names = [
             {
                 kind: str(getattr(run, field))[: 6 if field.endswith("hash") else None] or "none"
-                for kind, field in _FIELDS.items()
+                for kind, (field, _) in _DIFFERENCES.items()
             }
             for run in of_scene.values()
         ]
         differing = [
-            kind for kind in _FIELDS if kind != "scene" and len({n[kind] for n in names}) > 1
+            kind for kind in _DIFFERENCES if kind != "scene" and len({n[kind] for n in names}) > 1
         ]
         if len({tuple(n[kind] for kind in differing) for n in names}) < len(names):
             differing.append("scene")  # its hash covers the split, too
         values = {kind: ", ".join(dict.fromkeys(n[kind] for n in names)) for kind in differing}
-        what = "; ".join(f"{_MEANING[kind]} ({text})" for kind, text in values.items())
+        what = "; ".join(f"{_DIFFERENCES[kind][1]} ({text})" for kind, text in values.items())
         notice = f"{scene}: runs with different {what} cannot be compared, and stand apart"
         for test, n in zip(of_scene, names, strict=True):
             name = f"{scene} [{', '.join(f'{kind} {n[kind]}' for kind in differing)}]"
