@@ -210,32 +210,27 @@ def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[st
         ConfigError: If no configuration keeps to the limits on any scene.
     """
     sentences, fits_somewhere = [], False
-    nearest: tuple[float, str] | None = None
+    nearest: list[tuple[float, str]] = []
     for device, entries in entries_by_device(records).items():
         for scene, part in entries.groupby("scene", sort=False) if device else ():
             place = f"{scene}, {device}"
             found = sorted(_configurations(part), key=partial(_rank, budget=limits.seconds))
-            fitting = [config for config in found if limits.excess(config) <= 1]
-            if fitting and limits.psnr is not None:
-                best = min(fitting, key=lambda config: round(config["seconds"], 1))
-            elif fitting:
+            if fitting := [config for config in found if limits.excess(config) <= 1]:
                 best = fitting[0]
+                if limits.psnr is not None:
+                    best = min(fitting, key=lambda config: round(config["seconds"], 1))
+                fits_somewhere = True
+                sentences.append(f"{place}: {_sentence(best)}: {command_line('DIR', best)}")
             elif found:
-                nearest_one = min(found, key=lambda config: round(limits.excess(config), 2))
-                near = _sentence(nearest_one)
-                candidate = limits.excess(nearest_one), f"{near} on {place}"
-                nearest = min(filter(None, (nearest, candidate)))
+                closest = min(found, key=lambda config: round(limits.excess(config), 2))
+                near = _sentence(closest)
+                nearest.append((limits.excess(closest), f"{near} on {place}"))
                 sentences.append(f"{place}: nothing fits {wanted}; nearest: {near}")
-                continue
-            else:
-                continue
-            fits_somewhere = True
-            sentences.append(f"{place}: {_sentence(best)}: {command_line('DIR', best)}")
     if not fits_somewhere:
         raise ConfigError(
             wanted,
             expected="limits to which some of the runs keep",
-            found=f"none; nearest: {nearest[1]}" if nearest else "no run that was trained",
+            found=f"none; nearest: {min(nearest)[1]}" if nearest else "no run that was trained",
             todo="allow more, or add runs of other presets and methods",
         )
     return sentences
