@@ -26,7 +26,6 @@ from chronoscene.scene import Frame
 PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 """Shares of the training at which the probe views are rendered."""
 
-
 NOT_FINITE_LIMIT = 50
 """Steps in a row without a finite loss and finite gradients that end a training; one of several
 views counts as so many."""
@@ -37,6 +36,12 @@ BLANK_PSNR = 20.0
 _REMEDY = (
     "lower the learning rates, or take preset paper-scaled instead of paper, if the method has "
     "one, or report this with the scene"
+)
+
+_CHECKS = (
+    "check that the sparse points are spread over what the photos show, that these are not black "
+    "or masked throughout (chronoscene validate), and that lengths such as near_plane fit the unit "
+    "of the scene (length_unit=training does in any)"
 )
 
 SHORTEST_PAUSE = 1.0
@@ -199,20 +204,23 @@ def train(
         else:
             unseen.clear()
         if report.primitives == 0:
-            raise _untrainable(part, state, "a model with something in it", "nothing left")
+            raise _useless(part, state, "a model with something in it", "nothing left", _CHECKS)
         if _is_lost(unseen, state):
+            expected = "a training view that shows something of the model"
             found = f"{len(unseen)} steps in a row without, and a larger loss than at the start"
-            raise _lost(part, state.iterations, "a training view", found)
+            raise _useless(part, state, expected, found, _REMEDY)
         if state.empty_steps == state.iterations and (done >= 1.0 or len(unseen) == unseen.maxlen):
+            expected = "a training view that shows something of it"
             found = f"none in {state.iterations} steps"
-            raise _untrainable(part, state, "a training view that shows something of it", found)
+            raise _useless(part, state, expected, found, _CHECKS)
         if due and done >= due[0]:
             due = [share for share in due if share > done]
             point, is_blank = _probe(method, part, truth, state)
             state.curve.append(point)
             latest = point.psnr
             if is_blank and done >= 1.0:
-                raise _lost(part, state.iterations, "a test view", "nothing but black or white")
+                expected = "a test view that shows something of the model"
+                raise _useless(part, state, expected, "nothing but black or white", _REMEDY)
         observer(state.iterations, state.seconds, report, latest)
         if checkpoints is not None and checkpoints.is_due and last_good == state.iterations:
             checkpoints.write(method, state)
@@ -256,24 +264,9 @@ def _is_lost(unseen: deque[float], state: LoopState) -> bool:
     return float(np.mean(unseen)) > state.first_loss
 
 
-def _untrainable(part: Part, state: LoopState, expected: str, found: str) -> TrainingError:
-    return TrainingError(
-        f"model {part.name}, iteration {state.iterations}",
-        expected=expected,
-        found=found,
-        todo="check that the sparse points are spread over what the photos show, that these are "
-        "not black or masked throughout (chronoscene validate), and that lengths such as "
-        "near_plane fit the unit of the scene (length_unit=training does in any)",
-    )
-
-
-def _lost(part: Part, iteration: int, view: str, found: str) -> TrainingError:
-    return TrainingError(
-        f"model {part.name}, iteration {iteration}",
-        expected=f"{view} that shows something of the model",
-        found=found,
-        todo=_REMEDY,
-    )
+def _useless(part: Part, state: LoopState, expected: str, found: str, todo: str) -> TrainingError:
+    place = f"model {part.name}, iteration {state.iterations}"
+    return TrainingError(place, expected=expected, found=found, todo=todo)
 
 
 def _probe(method: Method, part: Part, truth: Truth, state: LoopState) -> tuple[CurvePoint, bool]:

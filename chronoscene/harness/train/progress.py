@@ -15,9 +15,7 @@ from chronoscene.methods import StepReport
 
 REFRESH = 0.1  # Seconds between two updates of the bar
 
-
 REPORTING = 1.0  # Seconds between two reports to another process
-
 
 SMOOTHING = 0.95  # Weight of the past in the loss that is shown
 
