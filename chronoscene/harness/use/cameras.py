@@ -191,7 +191,8 @@ def _around(run: TrainedRun, scene: Scene, frames: int, shape: OrbitShape) -> Ca
     poses = np.stack([frame.cam_from_world for frame in scene.frames])
     camera = ImageStore(scene, max_width=run.record.max_width).camera(scene.frames[0])
     if shape.size is not None:
-        camera = _with_size(camera, *shape.size)
+        width, height = shape.size  # with the same horizontal field of view
+        camera = _centred(width, height, camera.K[0, 0] * width / camera.width)
     points = scene.points.xyz
     path = orbit(poses, points, frames, radius=shape.radius, height=shape.height)
     return CameraSequence(
@@ -199,9 +200,8 @@ def _around(run: TrainedRun, scene: Scene, frames: int, shape: OrbitShape) -> Ca
     )
 
 
-def _with_size(camera: Camera, width: int, height: int) -> Camera:
-    """Return a camera of this size with the same horizontal field of view."""
-    focal = camera.K[0, 0] * width / camera.width
+def _centred(width: int, height: int, focal: float) -> Camera:
+    """Return a camera that looks at the middle of its image."""
     return Camera(1, "SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
 
 
@@ -258,8 +258,7 @@ def _camera(place: str, item: Mapping[str, Any], width: int, height: int) -> Cam
     fov = number(place, item, "fov")
     if fov is None or not 0 < fov < 180:
         raise json_error(place, "a fov between 0 and 180 degrees", repr(item.get("fov"))[:40])
-    focal = height / 2 / math.tan(math.radians(fov) / 2)
-    return Camera(1, "SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+    return _centred(width, height, height / 2 / math.tan(math.radians(fov) / 2))
 
 
 def _world_from_file(path: Path) -> Sim3:
