@@ -52,10 +52,9 @@ def map_run(run: TrainedRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> 
         ConfigError: If its models cannot tell periods apart, or give no depth.
         ImageError: If a file of the truth is damaged.
     """
-    store = ImageStore(scene, max_width=_width(run))
     for pair in pairs:
         made = map_pair(run, scene, pair, render=run.render)
-        yield made, score_map(run, scene, store, made)
+        yield made, score_map(run, scene, made)
 
 
 def map_pair(run: TrainedRun, scene: Scene, pair: tuple[int, int], *, render: Render) -> ChangeMap:
@@ -96,9 +95,7 @@ def _viewpoint(store: ImageStore, frame: Frame) -> Viewpoint:
     return Viewpoint(frame.name, store.camera(frame), frame.cam_from_world, frame.period)
 
 
-def score_map(
-    run: TrainedRun, scene: Scene, store: ImageStore, made: ChangeMap
-) -> dict[str, float]:
+def score_map(run: TrainedRun, scene: Scene, made: ChangeMap) -> dict[str, float]:
     """Score a map by its separation of changed and unchanged pixels of test views.
 
     The pixels of all views of the two periods are taken together. The baseline is the difference
@@ -108,6 +105,7 @@ def score_map(
         ``map_ap_geometry``, ``map_f1_geometry``, ``image_ap_geometry`` and so on; empty without
         a truth.
     """
+    store = ImageStore(scene, max_width=_width(run))
     scores: list[Array] = []
     masks: list[Pixels] = []
     for frame in scene.select(split="test"):
