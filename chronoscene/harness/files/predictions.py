@@ -185,7 +185,7 @@ class ImageWriter:
         scene: str,
         scene_hash: str,
         details: Mapping[str, Any],
-    ) -> Manifest:
+    ) -> None:
         """Write the manifest, last of all."""
         manifest = Manifest(
             format_version=1,
@@ -196,11 +196,10 @@ class ImageWriter:
             images=tuple(sorted(self._entries, key=lambda e: e.view)),
         )
         write_manifest(self.folder, manifest)
-        return manifest
 
-    def close_run(self, run: RunRecord) -> Manifest:
+    def close_run(self, run: RunRecord) -> None:
         """Write the manifest of the predictions of a run."""
-        return self.close(
+        self.close(
             kind="predictions",
             scene=run.scene,
             scene_hash=run.scene_hash,
