@@ -140,16 +140,11 @@ def _difference(entry: Mapping[Any, Any] | None) -> str:
 def _printed(entry: Mapping[Any, Any] | None) -> str:
     if entry is None:
         return "-"
-    number = in_unit(entry["quantity"], entry["mean"])
-    return f"{number} ({difference})" if (difference := _signed(entry)) else number
-
-
-def _signed(entry: Mapping[Any, Any]) -> str:
-    """Return a difference with its sign, or an empty text."""
-    if not entry["difference"] or math.isnan(entry["difference"]):
-        return ""
-    sign = "+" if entry["difference"] > 0 else "\N{MINUS SIGN}"
-    return sign + in_unit(entry["quantity"], abs(entry["difference"]))
+    number, difference = in_unit(entry["quantity"], entry["mean"]), entry["difference"]
+    if not difference or math.isnan(difference):
+        return number
+    sign = "+" if difference > 0 else "\N{MINUS SIGN}"
+    return f"{number} ({sign}{in_unit(entry['quantity'], abs(difference))})"
 
 
 def directions(study: Study, entries: DataFrame) -> list[str]:
