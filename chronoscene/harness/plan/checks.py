@@ -12,7 +12,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.formats import writable_formats
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.resolve import ResolvedRun
-from chronoscene.methods import ProgramConfig, Runner, has_function
+from chronoscene.methods import MethodSpec, ProgramConfig, Runner, has_function
 
 VALUES = ("data", "output", "work", "iterations", "seconds", "seed")
 """Values that a `Runner` may name besides the options of its config."""
@@ -69,43 +69,11 @@ def check_runner(run: ResolvedRun, runner: Runner) -> None:
     check_choice(f"{spec.name}: exports", runner.exports, writable_formats())
 
 
-def check_stages(run: ResolvedRun) -> None:
-    """Check that a method can be trained in stages.
-
-    Raises:
-        ConfigError: If it cannot, or is to be trained further after the last one.
-    """
-    job, spec = run.job, run.spec
-    if not has_function(spec, "extend"):
-        raise ConfigError(
-            f"{spec.name} --strategy {job.strategy}",
-            expected="a method that can be trained on one period after the other",
-            found="one without extend",
-            todo="use another strategy, or write the function: docs/guides/adding-a-method.md",
-        )
-    if job.settings.keep_training:
-        raise ConfigError(
-            f"--keep-training, --continue-to with --strategy {job.strategy}",
-            expected="neither, as a stage ends for good when the next one begins",
-            found="one of them",
-            todo="train anew with --iterations",
-        )
-
-
-def check_fitting(run: ResolvedRun) -> None:
-    """Check that the appearance of a method can be fitted to half of a photo.
-
-    Raises:
-        ConfigError: If it cannot.
-    """
-    spec = run.spec
-    if not has_function(spec, "fitted_to"):
-        raise ConfigError(
-            f"{spec.name} --fit-half",
-            expected="a method whose appearance belongs to single photos",
-            found="one without fitted_to",
-            todo="run it without --fit-half, which scores whole photos",
-        )
+def _check_function(spec: MethodSpec, name: str, option: str, expected: str, todo: str) -> None:
+    """Check that a method has the function that an option needs."""
+    if not has_function(spec, name):
+        place, found = f"{spec.name} {option}", f"one without {name}"
+        raise ConfigError(place, expected=expected, found=found, todo=todo)
 
 
 def check_run(run: ResolvedRun) -> None:
@@ -123,8 +91,20 @@ def check_run(run: ResolvedRun) -> None:
             todo="run this method without",
         )
     if STRATEGIES[job.strategy].in_order:
-        check_stages(run)
+        option = f"--strategy {job.strategy}"
+        expected = "a method that can be trained on one period after the other"
+        todo = "use another strategy, or write the function: docs/guides/adding-a-method.md"
+        _check_function(spec, "extend", option, expected, todo)
+        if settings.keep_training:
+            raise ConfigError(
+                f"--keep-training, --continue-to with {option}",
+                expected="neither, as a stage ends for good when the next one begins",
+                found="one of them",
+                todo="train anew with --iterations",
+            )
     if settings.fit_half:
-        check_fitting(run)
+        expected = "a method whose appearance belongs to single photos"
+        todo = "run it without --fit-half, which scores whole photos"
+        _check_function(spec, "fitted_to", "--fit-half", expected, todo)
     if spec.runner is not None:
         check_runner(run, spec.runner)
