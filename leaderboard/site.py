@@ -14,7 +14,7 @@ from markupsafe import Markup
 from chronoscene.figures.canvas import period_colors
 from chronoscene.harness.report.comparable import Setting, comparable, setting_of
 from chronoscene.harness.report.published import PublishedTable
-from chronoscene.harness.report.summary import kind_of, published_entries, summarise
+from chronoscene.harness.report.summary import name_of, published_entries, summarise
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.pages import render_page
 from chronoscene.io.staging import staged_folder
@@ -252,7 +252,7 @@ def _labels(pictured: Mapping[Path, Standing]) -> dict[Path, str]:
         record, mark = pictured[run].records[0], ", claimed" if pictured[run].claimed else ""
         tests.append(setting_of(record).test)
         if tests[-1] == tests[0]:
-            labels[run] = f"{record.title} ({kind_of(record)}){mark}"
+            labels[run] = f"{name_of(record)}{mark}"
     return labels
 
 

@@ -25,7 +25,7 @@ from chronoscene.harness.report.comparison_page import comparison_page
 from chronoscene.harness.report.figures.between import between_csv, between_table, draw_between
 from chronoscene.harness.report.figures.comparison import by_scene, chosen_views, draw_figures
 from chronoscene.harness.report.single_views import view_scores, worst_views
-from chronoscene.harness.report.summary import kind_of, read_runs
+from chronoscene.harness.report.summary import read_runs
 from chronoscene.harness.use.between import measure_between, parse_dates
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import write_text_atomic
@@ -156,9 +156,8 @@ def compare_between(
                     todo="name others",
                 )
             scene = opened[0].scene(root)
-            titles = [f"{record.title}\n{kind_of(record)}" for record in chosen]
             progress = partial(bar, f"{name}: render")
-            found.append(measure_between(opened, titles, scene, dates, own[0], progress=progress))
+            found.append(measure_between(opened, scene, dates, own[0], progress=progress))
     if style == "csv":
         emit(between_csv(found), out)
     else:

@@ -19,7 +19,7 @@ from chronoscene.harness.report.figures.comparison import (
     shown_run,
 )
 from chronoscene.harness.report.quality_curves import draw_curves
-from chronoscene.harness.report.summary import summarise
+from chronoscene.harness.report.summary import name_of, summarise
 from chronoscene.harness.report.tables import footnotes, period_name, readable_tables
 from chronoscene.harness.score.regions import scored_mask
 from chronoscene.io.pages import data_uri, render_page
@@ -93,7 +93,7 @@ def comparison_page(
 
 def _shown_views(found: dict[str, list[RunRecord]], max_bytes: int) -> dict[str, list[ShownView]]:
     """Return views of each scene, as many of each period as fit."""
-    methods = {scene: [*map(shown_run, of_scene)] for scene, of_scene in found.items()}
+    methods = {s: [(name_of(run), shown_run(run)) for run in runs] for s, runs in found.items()}
 
     def draw(scene: str, per_period: int) -> Iterator[ShownView]:
         first = found[scene][0]
@@ -114,13 +114,12 @@ def _shown_views(found: dict[str, list[RunRecord]], max_bytes: int) -> dict[str,
 
 
 def _shown_view(
-    truth: Path, entry: ImageEntry, methods: Sequence[ShownRun], labels: dict[str, str]
+    truth: Path, entry: ImageEntry, methods: Sequence[tuple[str, ShownRun]], labels: dict[str, str]
 ) -> ShownView:
-    photo, mask = load_image(truth, entry), scored_mask(truth, entry, methods[0].fitted)
+    photo, mask = load_image(truth, entry), scored_mask(truth, entry, methods[0][1].fitted)
     predictions = []
-    for run in methods:
+    for name, run in methods:
         image = load_image(run.folder, run.entries[entry.view])
-        name = run.title.replace("\n", " (") + ")"
         predictions.append((name, psnr_text(image, photo, mask), _picture(image)))
     period = period_name(entry.camera_period, labels)
     return ShownView(entry.view, period, _picture(photo), tuple(predictions))

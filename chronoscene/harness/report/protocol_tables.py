@@ -9,7 +9,7 @@ from statistics import fmean
 from chronoscene.harness.files.protocols import PROTOCOLS
 from chronoscene.harness.files.records import RunRecord
 from chronoscene.harness.report.published import PublishedTable
-from chronoscene.harness.report.summary import MEASURED, kind_of
+from chronoscene.harness.report.summary import MEASURED, name_of
 from chronoscene.io.tables import Table
 from chronoscene.metrics.registry import metric_info
 
@@ -40,7 +40,7 @@ def _measured(name: str, records: Sequence[RunRecord]) -> Iterator[ProtocolRow]:
     groups: dict[str, dict[str, list[RunRecord]]] = {}
     for run in records:
         if run.protocol == name:
-            scenes = groups.setdefault(f"{run.title} ({kind_of(run)})", {})
+            scenes = groups.setdefault(name_of(run), {})
             scenes.setdefault(run.scene, []).append(run)
     for label, scenes in groups.items():
         values: dict[str, float | None] = {}

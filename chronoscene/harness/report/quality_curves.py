@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from chronoscene.figures import canvas
 from chronoscene.harness.files.records import RunRecord
-from chronoscene.harness.report.summary import kind_of
+from chronoscene.harness.report.summary import name_of
 from chronoscene.harness.report.time_to_quality import read_curve
 
 SIZE = (6.4, 3.2)  # Width and height in inches
@@ -52,7 +52,7 @@ def _draw(records: Sequence[RunRecord], device: str) -> Curves | None:
     legend: dict[str, tuple[str, str]] = {}
     titles: dict[str, str] = {}
     for record in records:
-        color, name = colors[record.method], f"{record.title} ({kind_of(record)})"
+        color, name = colors[record.method], name_of(record)
         style = STYLES[sum(known == color for known, _ in legend.values()) % len(STYLES)]
         # None where another program made the images.
         found = [point for point in read_curve(record.folder) if math.isfinite(point.psnr)]

@@ -425,7 +425,7 @@ def labelled(records: Sequence[RunRecord]) -> DataFrame:
     runs["views"] = [
         frozenset((run.scene, row.camera_period, row.view) for row in run.rows) for run in records
     ]
-    runs["label"] = [f"{run.title} ({kind_of(run)})" for run in records]
+    runs["label"] = [name_of(run) for run in records]
     differences = pd.DataFrame(
         {
             "method": runs.method,
@@ -455,6 +455,11 @@ def short_commits(commits: str) -> str:
 def kind_of(run: RunRecord | Failure) -> str:
     """Name strategy, preset and the options that differ from it."""
     return ", ".join(filter(None, (run.strategy, run.preset, run.variant.replace(",", ", "))))
+
+
+def name_of(run: RunRecord) -> str:
+    """Name the method of a run and its settings, as tables do."""
+    return f"{run.title} ({kind_of(run)})"
 
 
 Number = tuple[str, str, float, Array]

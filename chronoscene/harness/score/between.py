@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from chronoscene.arrays import Array, Mask, Pixels
+from chronoscene.harness.files.records import RunRecord
 
 FRACTIONS = (0.25, 0.5, 0.75)
 """Times in between, 0 at the first date and 1 at the second."""
@@ -52,7 +53,8 @@ class BetweenScore:
 class MethodBetween:
     """A method between two dates: its images of one camera, and its score over all views."""
 
-    title: str
+    record: RunRecord
+    """The run that was rendered."""
     images: tuple[Pixels | None, ...]
     """At the first date, at `FRACTIONS` and at the second; None for what it cannot render."""
     score: BetweenScore | None

@@ -46,7 +46,6 @@ def parse_dates(run: TrainedRun, text: str) -> tuple[int, int]:
 
 def measure_between(
     runs: Sequence[TrainedRun],
-    titles: Sequence[str],
     scene: Scene,
     dates: tuple[int, int],
     view: str,
@@ -57,7 +56,6 @@ def measure_between(
 
     Args:
         runs: Runs of one scene; those without periods in between are rendered at the dates alone.
-        titles: Their names.
         scene: Their scene.
         dates: Two neighbouring periods.
         view: Test view whose images are kept, of one of the dates.
@@ -90,10 +88,10 @@ def measure_between(
             sums[i] += squared_distances(of_run, mask)
     gap = (None,) * len(FRACTIONS)
     methods = [
-        MethodBetween(title, tuple(images), BetweenScore.of(sums[i], pixels))
+        MethodBetween(run.record, tuple(images), BetweenScore.of(sums[i], pixels))
         if run.is_continuous
-        else MethodBetween(title, (images[0], *gap, images[-1]), None)
-        for i, (run, title, images) in enumerate(zip(runs, titles, shown, strict=True))
+        else MethodBetween(run.record, (images[0], *gap, images[-1]), None)
+        for i, (run, images) in enumerate(zip(runs, shown, strict=True))
     ]
     return SceneBetween(
         scene=scene.name,

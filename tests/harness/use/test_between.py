@@ -63,7 +63,7 @@ def test_a_figure_and_the_scores(runs, scene):
 def test_scores_are_those_of_the_renders(trained, scene):
     run = open_run(trained["chronogs"])
     whole = run.scene(scene)
-    found = measure_between([run], ["x"], whole, (1, 0), "a/2.png", progress=lambda *done: None)
+    found = measure_between([run], whole, (1, 0), "a/2.png", progress=lambda *done: None)
     sums = 0
     for frame in whole.select(split="test"):
         times = [1.0, *(1 - f for f in FRACTIONS), 0.0]

@@ -13,6 +13,7 @@ from chronoscene.figures import canvas
 from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.records import FIGURES
 from chronoscene.harness.report.figures.comparison import CELL_WIDTH
+from chronoscene.harness.report.summary import kind_of, name_of
 from chronoscene.harness.report.tables import period_name
 from chronoscene.harness.score.between import FRACTIONS, MethodBetween, SceneBetween
 from chronoscene.io.tables import Table, csv_text
@@ -64,7 +65,7 @@ def draw_between(runs: Path, found: SceneBetween) -> Path:
 
 
 def _row_title(method: MethodBetween) -> str:
-    title = canvas.plain_lines(method.title)
+    title = canvas.plain_lines(f"{method.record.title}\n{kind_of(method.record)}")
     if method.score is not None and not math.isnan(method.score.ratio):
         title += f"\nratio {method.score.ratio:.2f}"
     return title
@@ -78,7 +79,7 @@ def between_table(found: SceneBetween) -> Table:
         score = method.score
         values = () if score is None else (score.distance, score.change, score.ratio)
         texts = ["-" if math.isnan(value) else f"{value:.3f}" for value in values]
-        rows.append([method.title.replace("\n", " (") + ")", *(texts or "---")])
+        rows.append([name_of(method.record), *(texts or "---")])
     names = [period_name(date, found.labels) for date in found.dates]
     mask = "ground truth" if found.from_truth else "renders"
     title = (
@@ -95,7 +96,6 @@ def between_csv(found: Sequence[SceneBetween]) -> str:
         for method in scene.methods:
             score = method.score
             values = (None,) * 3 if score is None else (score.distance, score.change, score.ratio)
-            name = method.title.replace("\n", " (") + ")"
-            mask = "truth" if scene.from_truth else "renders"
+            name, mask = name_of(method.record), "truth" if scene.from_truth else "renders"
             rows.append([scene.scene, *scene.dates, name, *values, scene.pixels, mask])
     return csv_text(CSV_COLUMNS, rows)

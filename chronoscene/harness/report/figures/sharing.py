@@ -11,7 +11,7 @@ import numpy as np
 
 from chronoscene.figures import canvas
 from chronoscene.harness.files.records import FIGURES, RunRecord
-from chronoscene.harness.report.summary import kind_of
+from chronoscene.harness.report.summary import name_of
 
 COLUMNS = 2
 PANEL = (4.2, 2.3)  # Inches
@@ -24,7 +24,7 @@ def draw_sharing(runs: Path, records: Sequence[RunRecord]) -> list[Path]:
     for record in records:
         if record.sharing is not None:
             of_scene = scenes.setdefault(record.scene, {})
-            of_scene.setdefault(f"{record.title} ({kind_of(record)})", []).append(record)
+            of_scene.setdefault(name_of(record), []).append(record)
     if not scenes:
         return []
     labels = list(dict.fromkeys(label for of_scene in scenes.values() for label in of_scene))
