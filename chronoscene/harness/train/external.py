@@ -25,7 +25,7 @@ from chronoscene.errors import ImageError, ProgramError
 from chronoscene.formats import load_format, read_scene
 from chronoscene.formats.shared.ply import count_vertices
 from chronoscene.harness.files import records
-from chronoscene.harness.files.predictions import ImageWriter, encode_png
+from chronoscene.harness.files.predictions import ImageWriter, encode_png, to_grey
 from chronoscene.harness.files.provenance import method_version, processor_name
 from chronoscene.harness.files.source import write_source
 from chronoscene.harness.plan.checks import used_values
@@ -228,20 +228,18 @@ def _write_photos(
     """
     folder.mkdir()
     masks: dict[str, Path] = {}
+    any_masked = False
     for i, frame in enumerate(frames):
-        pixels, mask = np.zeros((*store.camera(frame).size[::-1], 3), np.uint8), None
+        size = store.camera(frame).size[::-1]
+        pixels, mask = np.zeros((*size, 3), np.uint8), None
         if frame.name in trained:
             pixels, mask = store.load(frame), store.load_mask(frame)
+        any_masked |= mask is not None
         (folder / f"{i:05d}.png").write_bytes(encode_png(pixels))
-        if mask is not None:
-            masks[frame.name] = folder / f"{i:05d}.mask.png"
-            masks[frame.name].write_bytes(encode_png(255 * mask.astype(np.uint8)))
-    for i, frame in enumerate(frames if masks else []):
-        if frame.name not in masks:
-            masks[frame.name] = folder / f"{i:05d}.mask.png"
-            white = np.full(store.camera(frame).size[::-1], 255, np.uint8)
-            masks[frame.name].write_bytes(encode_png(white))
-    return masks
+        masks[frame.name] = folder / f"{i:05d}.mask.png"
+        whole = np.ones(size, bool) if mask is None else mask
+        masks[frame.name].write_bytes(encode_png(to_grey(whole)))
+    return masks if any_masked else {}
 
 
 def _find_images(
