@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -456,23 +456,27 @@ def footnotes(
         )
     if units := "; ".join(f"{unit} of {titles}" for unit, titles in _grouped(counted)):
         notes.append(f"primitives: {units}")
-    absent = []
-    for run in records:
-        costs = [(COST_TITLES.get(cost), why) for cost, why in run.absent.items()]
-        there = {*run.skipped, *run.aggregates.get("macro", {})}
-        unasked = [
-            (name, f"no value: chronoscene score RUNS --metric {name} computes it where it can be")
-            for name in wanted
-            if name not in there
-        ]
-        for missing, reason in (*run.skipped.items(), *costs, *unasked):
-            if missing in wanted if wanted else missing:
-                absent.append((reason, missing))
-    notes += [f"absent: {names}: {reason}" for reason, names in _grouped(absent)]
+    absent = _grouped((why, name) for run in records for name, why in _absent(run, wanted))
+    notes += [f"absent: {names}: {reason}" for reason, names in absent]
     notes += dict.fromkeys(notice for run in records for notice in run.notices)
     failed = [((f"{f.scene}, {f.method} ({kind_of(f)})", f.reason), f.seed) for f in failures]
     notes += [f"failed: {n}, seed {seeds}: {reason}" for (n, reason), seeds in _grouped(failed)]
     return notes
+
+
+def _absent(run: RunRecord, wanted: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield metrics and costs that a run lacks, each with the reason; metrics alone if wanted."""
+    there = {*run.skipped, *run.aggregates.get("macro", {})}
+    for name, reason in run.skipped.items():
+        if not wanted or name in wanted:
+            yield name, reason
+    for cost, reason in run.absent.items() if not wanted else ():
+        if cost in COST_TITLES:
+            yield COST_TITLES[cost], reason
+    for name in wanted:
+        if name not in there:
+            reason = f"no value: chronoscene score RUNS --metric {name} computes it where it can be"
+            yield name, reason
 
 
 def _grouped(pairs: Iterable[tuple[Any, Any]]) -> Iterable[tuple[Any, str]]:
