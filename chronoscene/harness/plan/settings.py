@@ -101,7 +101,7 @@ class BenchSettings:
         """Refuse settings that contradict each other.
 
         Raises:
-            ConfigError: If a strategy or a way of sharing is unknown, a number is too small,
+            ConfigError: If a strategy or a way of sharing is unknown, a number is out of range,
                 several options give a number of iterations, of which one would win silently, or one
                 contradicts the protocol.
         """
@@ -132,29 +132,25 @@ class BenchSettings:
             )
 
     def _check_numbers(self) -> None:
-        """Refuse numbers that no option of a command lets through."""
-        least = {
-            "--max-width": (self.run.max_width, 1),
-            "--threads": (self.run.threads, 1),
-            "--jobs": (self.jobs, 1),
-            "--seed": (min(self.seeds, default=0), 0),
+        """Refuse numbers without a meaning, most of which no option of a command lets through."""
+        counts = {
+            "--max-width": self.run.max_width,
+            "--threads": self.run.threads,
+            "--jobs": self.jobs,
         }
-        for option, (number, smallest) in least.items():
-            if number is not None and number < smallest:
-                raise ConfigError(
-                    option,
-                    expected=f"{smallest} or more",
-                    found=str(number),
-                    todo="choose another number",
-                )
+        for option, number in counts.items():
+            if number is not None and number < 1:
+                raise _refused(option, "1 or more", number)
+        for seed in self.seeds:
+            if not 0 <= seed < 2**64:
+                raise _refused("--seed", "seeds from 0 to 2^64 - 1", seed)
         budget = self.run.budget_seconds
         if budget is not None and not 0 < budget < math.inf:
-            raise ConfigError(
-                "--budget",
-                expected="a positive number of seconds",
-                found=str(budget),
-                todo="choose another number, or leave it out",
-            )
+            raise _refused("--budget", "a positive number of seconds", budget)
+
+
+def _refused(option: str, expected: str, found: float) -> ConfigError:
+    return ConfigError(option, expected=expected, found=str(found), todo="choose another number")
 
 
 def bench_settings(
