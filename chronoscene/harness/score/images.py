@@ -173,21 +173,7 @@ def score_images(
         ImageError: If images are missing, too many, or of another size.
     """
     check_scene(scene)
-    if not scene.select(split="test"):
-        raise SceneError(
-            scene.root,
-            expected="test views to score",
-            found=f"none ({scene.split_rule})",
-            todo=f"choose some (chronoscene split {scene.root} --scene-out NEW), and use NEW",
-        )
-    if not re.search(r"\w", name):
-        raise ConfigError(
-            "--name",
-            expected="letters or digits",
-            found=repr(name),
-            todo="choose the name that tables are to show",
-        )
-    method = re.sub(r"[^\w.+-]+", "-", name)
+    tests, method = _test_views(scene), _method_name(name)
     out = runs / safe_part(scene.name) / f"{method}-{STRATEGY}-{PRESET}" / f"seed{seed}"
     if out.exists():
         raise ConfigError(
@@ -222,7 +208,7 @@ def score_images(
     )
     with staged_folder(out) as staging:
         writer = ImageWriter(staging / records.PREDICTIONS)
-        resized = add_images(writer, scene.select(split="test"), images, max_width)
+        resized = add_images(writer, tests, images, max_width)
         details = {"name": name, "folder": str(folder.resolve()), "resized": resized}
         writer.close(kind="predictions", scene=scene.name, scene_hash=digest, details=details)
         if resized:
@@ -233,3 +219,27 @@ def score_images(
         write_text_atomic(staging / records.CONFIG_FILE, json.dumps(document, indent=1) + "\n")
         score_run(staging, record, ground_truth_folder(runs, scene.name), scorers)
     return out
+
+
+def _test_views(scene: Scene) -> tuple[Frame, ...]:
+    """Return the test views of a scene, of which there must be some."""
+    if not (tests := scene.select(split="test")):
+        raise SceneError(
+            scene.root,
+            expected="test views to score",
+            found=f"none ({scene.split_rule})",
+            todo=f"choose some (chronoscene split {scene.root} --scene-out NEW), and use NEW",
+        )
+    return tests
+
+
+def _method_name(name: str) -> str:
+    """Return the name of a program as that of a method, without spaces and the like."""
+    if not re.search(r"\w", name):
+        raise ConfigError(
+            "--name",
+            expected="letters or digits",
+            found=repr(name),
+            todo="choose the name that tables are to show",
+        )
+    return re.sub(r"[^\w.+-]+", "-", name)
