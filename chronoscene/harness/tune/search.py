@@ -135,26 +135,7 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
     strategies = settings.strategies or (method.spec.strategy,)
     settings = replace(settings, strategies=strategies)
     start = starting_point(method.spec, method.config)
-    scenes = []
-    for found in settings.scenes:
-        log(f"read {found.path}")
-        scene = read_bench_scene(found, validation=True)
-        scenes.append({"name": scene.name, "hash": scene_hash(scene)})
-    ours = {
-        "method": method.spec.name,
-        "preset": run.preset_name,
-        "iterations": method.config.iterations,
-        "options": deciding_options(method.config),
-        "space": {
-            name: list(space) if isinstance(space, tuple) else [space.low, space.high, space.kind]
-            for name, space in method.spec.search.items()
-        },
-        "scenes": scenes,
-        "strategy": strategies[0],
-        "max_width": run.max_width,
-        "seed": seed,
-    }
-    ours = json.loads(json.dumps(ours))  # as it is read again
+    ours = _about(settings, method, log)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = JournalStorage(JournalFileBackend(str(out / JOURNAL)))
     study = optuna.create_study(
@@ -174,6 +155,31 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
     if not study.trials:
         study.enqueue_trial(start)
     return _Search(settings, out, method, seed, study, ours)
+
+
+def _about(settings: BenchSettings, method: ResolvedMethod, log: Log) -> dict[str, Any]:
+    """Return the values that identify a search, in the form in which they are read again."""
+    scenes = []
+    for found in settings.scenes:
+        log(f"read {found.path}")
+        scene = read_bench_scene(found, validation=True)
+        scenes.append({"name": scene.name, "hash": scene_hash(scene)})
+    about = {
+        "method": method.spec.name,
+        "preset": settings.run.preset_name,
+        "iterations": method.config.iterations,
+        "options": deciding_options(method.config),
+        "space": {
+            name: list(space) if isinstance(space, tuple) else [space.low, space.high, space.kind]
+            for name, space in method.spec.search.items()
+        },
+        "scenes": scenes,
+        "strategy": settings.strategies[0],
+        "max_width": settings.run.max_width,
+        "seed": settings.seeds[0],
+    }
+    found_again: dict[str, Any] = json.loads(json.dumps(about))
+    return found_again
 
 
 def _run_trials(
