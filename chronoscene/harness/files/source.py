@@ -75,7 +75,7 @@ def read_source(folder: Path) -> RunSource:
 
 
 def read_bench_scene(found: DetectedFormat, *, validation: bool, shrink: int = 1) -> Scene:
-    """Read a scene as runs have it: bench, its workers, and whoever opens a run later.
+    """Read a scene as runs use it: in bench, in its workers, and when a run is opened later.
 
     Args:
         found: Folder of the scene, with its format.

@@ -33,12 +33,12 @@ def is_finished(run: ResolvedRun, overwrite: bool = False) -> bool:
 
 
 def is_obsolete(run: ResolvedRun, overwrite: bool = False) -> bool:
-    """Return True for checkpoints of a training with other settings, which may be deleted.
+    """Return True if there are checkpoints that may be deleted: of a training with other settings.
 
-    So may those whose settings are missing, as their deletion was interrupted.
+    Checkpoints without settings are what an interrupted deletion has left.
 
     Raises:
-        ConfigError: If there are such, and they may not be deleted.
+        ConfigError: If there are checkpoints with other settings that may not be deleted.
     """
     if not (run.job.training / records.CONFIG_FILE).is_file():
         return run.job.training.is_dir()
@@ -83,15 +83,15 @@ def first_difference(old: Any, new: Any, key: str = "settings") -> tuple[str, st
 
 
 def continued(run: ResolvedRun, method: ResolvedMethod, iterations: int) -> ResolvedRun:
-    """Return the run that trains a finished one further: the longest there is.
+    """Return the run that trains the longest finished one further.
 
     Args:
-        run: With the settings of the finished run, apart from the number of iterations.
+        run: The run with the settings of the finished one, apart from the number of iterations.
         method: Its method.
-        iterations: Of the whole training.
+        iterations: Number of iterations of the whole training.
 
     Raises:
-        ConfigError: If there is no such run, or nothing to train further or to go on from.
+        ConfigError: If there is no finished run, or it did not keep its training.
     """
     there = {done.config.iterations: done for done in _other_lengths(run, method)}
     shorter = [length for length in there if length <= iterations]

@@ -41,7 +41,7 @@ _MODEL = 10**9
 
 @dataclass(frozen=True, slots=True)
 class PhotoNeeds:
-    """Memory and disk space of the photos of a scene, in bytes; of training photos, if not said."""
+    """Memory and disk space of the training photos of a scene, in bytes unless noted."""
 
     scene: str
     count: int
@@ -136,17 +136,17 @@ def check_room(
     """Check that memory and disk have room for the photos of a scene.
 
     Args:
-        needs: Of its runs.
-        folder: Of all runs.
-        runs: How many runs are to be done.
-        views: Views that they render at the same time, at most.
-        here: True if this machine does them, so that its memory counts.
+        needs: Needs of its runs.
+        folder: Folder of all runs.
+        runs: Number of runs to do.
+        views: Largest number of views that a run renders at the same time.
+        here: True if the runs are done on this machine, whose memory is then checked.
 
     Returns:
-        What they take, in a line for the user.
+        A line for the user that says what the photos take.
 
     Raises:
-        ConfigError: If they have not; the message says which setting would do.
+        ConfigError: If there is not enough room; the message names a setting that would fit.
     """
     training = needs.training(views)
     _check_memory(needs, training, machine_memory()[1] if here else None)
@@ -163,8 +163,8 @@ def device_need(scene: Scene, needs: PhotoNeeds, spec: MethodSpec, config: Metho
     """Describe what a training takes of the memory of a GPU; empty if the method does not say.
 
     Args:
-        scene: What it is trained on.
-        needs: Of its photos.
+        scene: The scene that it is trained on.
+        needs: Needs of its photos.
         spec: The method.
         config: Its options.
     """

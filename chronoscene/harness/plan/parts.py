@@ -21,8 +21,8 @@ from chronoscene.scene.similarity import Sim3
 EXTENT_MARGIN = 1.1  # Factor of 3DGS between the farthest camera and the camera extent
 CLOSE = 0.5
 """Cameras within this share of the depth of what they see leave the size of the scene to it."""
-MOST_VIEWS, MOST_POINTS = 100, 5_000  # That a median depth is taken from
-LEAST_SPREAD = 1e-6  # Of the points, over the distance of the farthest camera
+MOST_VIEWS, MOST_POINTS = 100, 5_000  # For a median depth
+LEAST_SPREAD = 1e-6  # Of the points, relative to the distance of the farthest camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +86,7 @@ def make_parts(
         scene: What is trained on.
         store: Its images.
         strategy: One of `STRATEGIES`.
-        takes_period: Whether the method takes the period.
+        takes_period: False if the method does not take the period.
 
     Raises:
         SceneError: If a camera is distorted, images or points are missing that are needed, or all
@@ -183,7 +183,7 @@ def training_frame(scene: Scene, periods: range | None = None) -> Sim3:
 def _median_depth(frames: Sequence[Frame], xyz: Array) -> float:
     """Return the median over images of the median depth of the points in them; 0 without any.
 
-    Of many images and points, some that are evenly chosen.
+    Large sets of images and points are sampled evenly.
     """
     frames = frames[:: len(frames) // MOST_VIEWS + 1]
     xyz = xyz[:: len(xyz) // MOST_POINTS + 1]

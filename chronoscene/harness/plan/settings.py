@@ -23,9 +23,10 @@ PHOTO_MEMORY = 2 * 10**9
 PHOTO_DISK = 20 * 10**9
 
 SHARING = ("total", "each")
-"""The models of ``separate``, or the stages of ``sequential``, share iterations and time, or each
-get all of them. ``each`` is the default of `MethodSpec.per_period`, where it is for ``joint``, too:
-one model of T periods gets them T times."""
+"""The models of ``separate``, or the stages of ``sequential``, share iterations and time
+(``total``), or each of them gets all (``each``). ``each`` is the default of the presets in
+`MethodSpec.per_period`; with these it holds for ``joint``, too, whose model of T periods gets all
+T times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +38,12 @@ class RunSettings:
     preset: str = "balanced"
     """Name of a preset of the methods, or path of a preset file."""
     overrides: Mapping[str, str] = field(default_factory=dict)
-    """Options of the methods: ``key`` for all that are run, or ``method.key`` for one. Those of a
-    job have no prefix."""
+    """Options of the methods: ``key`` for all that are run, or ``method.key`` for one. In the
+    settings of a job, keys have no prefix."""
     iterations: int | None = None
     budget_seconds: float | None = None
     separate_iterations: str | None = None
-    """One of `SHARING`; None for that of the preset. Those of a run have one."""
+    """One of `SHARING`; None for that of the preset, which planning fills in."""
     max_width: int = MAX_WIDTH
     """Pixels; wider images are scaled down to it."""
     threads: int | None = None
@@ -84,7 +85,7 @@ class BenchSettings:
     """Names, or ``module:SPEC``."""
     run: RunSettings
     strategies: tuple[str, ...] = ()
-    """None: `MethodSpec.strategy` of each method."""
+    """Empty for `MethodSpec.strategy` of each method."""
     seeds: tuple[int, ...] = (0,)
     continue_to: int | None = None
     """Train finished runs further, up to this many iterations."""

@@ -110,11 +110,11 @@ def margins(
 
 
 def _studentised(errors: Array, freedom: float) -> tuple[Array, Array]:
-    """Divide errors by their standard deviation as few values estimate it, times the true one.
+    """Scale errors by the true standard deviation over one that is estimated from few values.
 
     Args:
         errors: Of pairs of methods; drawn together. [..., REPLICATES]
-        freedom: How many values; for each draw, that many others take their place.
+        freedom: Number of these values; for each draw, as many other draws stand for them.
 
     Returns:
         errors: Studentised. [..., REPLICATES]

@@ -88,7 +88,7 @@ def _correlations(n: int) -> Array:
 
 @lru_cache
 def degrees_of_freedom(n: int) -> float:
-    """Compute those of the variance of resampled means of n views; NaN for a single view.
+    """Compute the degrees of freedom of the variance of means of n views; NaN for a single view.
 
     The variance is x^T A x of the values x, with the covariance A of the weights. For normal values
     with covariance S it is spread as a chi-squared with tr(A S)^2 / tr(A S A S) of them.
@@ -117,7 +117,7 @@ def pooled_freedom(counts: Iterable[int], weights: Iterable[float] | None = None
 
 
 def interval(resampled: Array, freedom: ArrayLike) -> tuple[Array, Array]:
-    """Compute the ends of percentile intervals, wider by what t has over the normal distribution.
+    """Compute the ends of percentile intervals, widened by the ratio of t to normal quantiles.
 
     Args:
         resampled: Resampled means. [..., REPLICATES]

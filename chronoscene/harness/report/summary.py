@@ -218,7 +218,7 @@ def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
 def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> DataFrame:
     """Compute means, spread over seeds and intervals over views of everything that was measured.
 
-    Runs that differ in seed, device and commit only are a group. Runs of equal names with other
+    Runs that differ only in seed, device and commit form a group. Runs of equal names with other
     configs stay apart, and so do devices or commits that ran the same seed: their ``label`` says in
     what they differ.
 

@@ -197,9 +197,10 @@ class Limits:
 def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[str]:
     """Name the configuration to use within limits, in a sentence for each scene and device.
 
-    It is the best one in PSNR; where a PSNR is to be reached, the one that is trained in the least
-    time. Among those that read alike, it is the best in the other one, then the smallest, and then
-    the best in digits that are not printed. All trainings that used up a time took as long.
+    It is the one with the best PSNR; where a PSNR is to be reached, the one with the shortest
+    training. Where the printed values are equal, the other of these two decides, then the size of
+    the model, and then the digits of PSNR that are not printed. Trainings that used up the budget
+    count as equally long.
 
     Args:
         records: Runs of any scenes.

@@ -98,7 +98,7 @@ class LocalPool:
                 self._changed.notify_all()
 
     def _free(self) -> int:
-        """Bytes of memory that are free, without those that runs under way are still to take."""
+        """Bytes of free memory, less those that runs under way are still expected to take."""
         import psutil
 
         held = 0

@@ -36,7 +36,7 @@ def run_in_process(
 
 @contextmanager
 def staged(job: Job) -> Iterator[Job]:
-    """The job with an empty staging folder beside its final one, which goes if the block fails.
+    """Yield the job with an empty staging folder beside its final one, deleted if the block fails.
 
     Its name says who made it: workers of a killed bench may still write into theirs.
     """
@@ -51,10 +51,10 @@ def staged(job: Job) -> Iterator[Job]:
 
 
 def run_staged(job: Job, *, report: Report | None = None, stop: Stop | None = None) -> None:
-    """Execute a job in a new process, so that its staging folder has a result or says why not.
+    """Execute a job in a new process, which leaves a result or a failure in its staging folder.
 
     Raises:
-        DiskFullError: If there is no space for it.
+        DiskFullError: If there is no space for either.
     """
     staging = Path(job.staging)
     outcome = run_worker(
@@ -69,7 +69,7 @@ def run_staged(job: Job, *, report: Report | None = None, stop: Stop | None = No
 
 
 def put_in_place(job: Job, staging: Path) -> records.Failure | None:
-    """Give what a worker wrote its final name; returns why the run failed, if it did."""
+    """Move what a worker wrote to its final place; return the failure of the run, if it failed."""
     failure = records.read_failure(staging)
     if job.folder.exists():
         shutil.rmtree(job.folder)

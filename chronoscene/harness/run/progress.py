@@ -15,7 +15,7 @@ from chronoscene.io.log import Log
 from chronoscene.io.processes import Report
 from chronoscene.io.wording import format_time
 
-KNOWN = 0.1  # Share of a run after which the time left is shown: before, it mostly starts
+KNOWN = 0.1  # Share of a run after which rate and time left are shown: before, it mostly starts
 
 
 class RunsDisplay:

@@ -67,7 +67,7 @@ class Checkpoints:
     """The checkpoints of one model of a run."""
 
     folder: Path
-    """Folder of this model alone; created at need."""
+    """Folder of this model alone; created when it is needed."""
     settings: dict[str, Any]
     """Settings of the run, written beside the folder."""
     commit: str
@@ -75,7 +75,7 @@ class Checkpoints:
     every: float
     """Seconds between checkpoints."""
     keep_last: bool
-    """True if the end of the training is a checkpoint, then the only one that is kept."""
+    """True if a checkpoint is written at the end of the training and kept as the only one."""
     start: Path | None
     """Folder with checkpoints of a shorter training of the same model, to begin with."""
     log: Log

@@ -52,7 +52,7 @@ def measure_between(
     *,
     progress: Callable[[int, int], None],
 ) -> SceneBetween:
-    """Render the test views of two dates at the dates and in between, and score what is there.
+    """Render the test views of two dates at the dates and in between, and score the renders.
 
     Args:
         runs: Runs of one scene; those without periods in between are rendered at the dates alone.

@@ -107,13 +107,13 @@ def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = 
 def make_file(
     run: TrainedRun, scene: Scene, period: float, prepared: Prepared, kind: str
 ) -> Export:
-    """Make a file of what `prepare` gave, and measure it as it is read.
+    """Make a file of prepared Gaussians, and measure its loss as read back.
 
     Args:
         run: The run.
         scene: Its scene.
         period: As for `prepare`.
-        prepared: What `prepare` gave.
+        prepared: Result of `prepare`.
         kind: Format, of `chronoscene.splat_files.SUFFIXES`.
     """
     up = find_up(np.stack([frame.cam_from_world for frame in scene.frames]))

@@ -43,7 +43,7 @@ FRUSTUM = 0.2
 STEP_BACK = 1.5
 """Distance of the first view in that of the cameras: most of them are in it."""
 TEST_PHOTO_SHARE = 0.25
-"""Part of the limit that photos of test views may take from the Gaussians."""
+"""Part of the limit that photos of test views may take before the Gaussians."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ def write_page(
         periods: Periods that are in the page.
         max_bytes: Limit of all files together. Photos of training views are left out first, then
             what `fit_gaussians` names.
-        report: Function to tell the progress.
+        report: Called with the progress.
 
     Raises:
         ConfigError: If a method has no Gaussians, or the limit is too small.

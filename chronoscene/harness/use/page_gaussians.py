@@ -129,7 +129,7 @@ def _size(packed: Sequence[PackedGaussians]) -> int:
 
 
 def _more_reduced(reduction: Reduction, fits: float) -> Reduction:
-    """Reduce what fits to this share."""
+    """Reduce further, where this share of the present size would fit."""
     if reduction.degree > 1:
         return replace(reduction, degree=reduction.degree - 1)
     return replace(reduction, share=reduction.share * min(0.95, 0.98 * fits))

@@ -191,7 +191,7 @@ class TrainedRun:
         return View(camera.K, camera.width, camera.height, pose)
 
     def frame_views(self, scene: Scene, frames: Iterable[Frame]) -> list[View]:
-        """Return frames of the scene as `view` does, at the size at which they were trained on."""
+        """Return frames of the scene as `view` does, at the size of the training."""
         store = ImageStore(scene, max_width=self.record.max_width)
         return [self.view(store.camera(frame), frame.cam_from_world) for frame in frames]
 
