@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import MANIFEST
-from chronoscene.harness.files.records import RunRecord, ViewScore
+from chronoscene.harness.files.records import RunRecord, ViewScore, variant_options
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.report.comparable import KEY
 from chronoscene.harness.report.summary import COSTS
@@ -202,7 +202,7 @@ def _check_texts(record: RunRecord) -> None:
         raise ValueError(f"unknown strategy: {record.strategy}")
     if not _VARIANT.fullmatch(record.variant) or _WORDS.search(record.variant):
         raise ValueError(f"variant is no list of options: {record.variant[:60]!r}")
-    if "validation=true" in record.variant.split(","):
+    if variant_options(record.variant).get("validation") == "true":
         raise ValueError("scores of validation views: run bench without --validation")
     if record.fitted:
         raise ValueError("scores of halves of photos: run bench without --fit-half")

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from chronoscene.harness.files.command_line import command_line
-from chronoscene.harness.files.records import RunRecord
+from chronoscene.harness.files.records import RunRecord, variant_options
 from chronoscene.harness.report.comparable import budget_of
 from chronoscene.harness.report.published import load_published
 from chronoscene.harness.report.tradeoff import BUDGET_TOLERANCE, as_configurations
@@ -93,7 +93,7 @@ def check_effort(run: RunRecord) -> None:
     Raises:
         ValueError: If they are more.
     """
-    options = dict(part.partition("=")[::2] for part in run.variant.split(","))
+    options = variant_options(run.variant)
     models = len(run.period_labels)
     if "budget" in options:
         budget, late = budget_of(run), 1 + BUDGET_TOLERANCE

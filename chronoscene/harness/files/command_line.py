@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from chronoscene.harness.files.records import variant_options
 from chronoscene.methods import installed_methods, load_spec
 from chronoscene.methods.preset_files import SUFFIX
 
@@ -31,9 +31,7 @@ def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None)
     words += ["--preset", _preset(config["method"], config["preset"])]
     words += [] if seed is None else ["--seed", str(seed)]
     compress: list[str] = []
-    # A comma inside of a value is followed by no name.
-    for assignment in filter(None, re.split(r",(?=\w+=)", config["variant"])):
-        name, _, value = assignment.partition("=")
+    for name, value in variant_options(config["variant"]).items():
         if name == "iterations" and "+" in value:
             words += ["--continue-to", value.rpartition("+")[2]]
         elif name == "compressed":
@@ -44,7 +42,7 @@ def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None)
         elif name in OPTIONS:
             words += [f"--{name.replace('_', '-')}", value]
         else:
-            words += ["--set", assignment]
+            words += ["--set", f"{name}={value}"]
     return " && ".join(map(shlex.join, filter(None, (words, compress))))
 
 

@@ -11,6 +11,7 @@ import csv
 import json
 import math
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -182,6 +183,13 @@ class RunRecord(BaseModel):
         """Name of the run, as `Job.label`."""
         names = (self.method, self.strategy, self.preset, self.variant)
         return f"{self.scene}: {' '.join(filter(None, names))} seed {self.seed}"
+
+
+def variant_options(variant: str) -> dict[str, str]:
+    """Return the options in a `RunRecord.variant`, with their values as text."""
+    # A comma inside of a value is followed by no name.
+    parts = filter(None, re.split(r",(?=\w+=)", variant))
+    return dict(part.partition("=")[::2] for part in parts)
 
 
 class _Decides(BaseModel):

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from chronoscene.errors import ConfigError
-from chronoscene.harness.files.records import RunRecord
+from chronoscene.harness.files.records import RunRecord, variant_options
 from chronoscene.io.wording import shown
 
 KEY = (
@@ -69,7 +69,7 @@ def effort_of(run: RunRecord) -> str:
 
 def budget_of(run: RunRecord) -> float | None:
     """Return the seconds that a run was allowed, all models together; None if steps end it."""
-    options = dict(part.partition("=")[::2] for part in run.variant.split(","))
+    options = variant_options(run.variant)
     if budget := re.fullmatch(r"(\d+(?:\.\d+)?(?:e\+\d+)?)s", options.get("budget", "")):
         each = options.get("separate_iterations") == "each" and run.strategy != "pooled"
         return float(budget[1]) * (len(run.period_labels) if each else 1)

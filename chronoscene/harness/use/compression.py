@@ -39,6 +39,7 @@ from chronoscene.harness.files.records import (
     SOURCE_FILE,
     read_config,
     size_of,
+    variant_options,
     write_summary,
 )
 from chronoscene.harness.files.strategies import period_part
@@ -139,7 +140,7 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
             found=f"strategy {run.record.strategy}",
             todo="compress a run under another strategy",
         )
-    if any(part.startswith("compressed=") for part in run.record.variant.split(",")):
+    if "compressed" in variant_options(run.record.variant):
         raise ConfigError(
             run.folder,
             expected="a run as it was trained",
