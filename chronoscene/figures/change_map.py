@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Ints, Pixels
 from chronoscene.figures import canvas
 from chronoscene.figures.cloud import Cloud, shown_box
 from chronoscene.figures.projections import draw_points, label_axes, readable
@@ -35,8 +34,14 @@ class ChangePanel:
     title: str
     xyz: Array
     """Places. [N, 3]"""
-    classes: NDArray[np.int64]
+    classes: Ints
     """Classes of the places. [N]"""
+
+
+def colors_of(classes: Ints) -> Pixels:
+    """Return the colours of places by their classes. [N, 3]"""
+    palette = np.array([canvas.rgb_of(color) for color in COLORS.values()])
+    return palette.astype(np.uint8)[classes]
 
 
 def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path) -> None:

@@ -12,8 +12,8 @@ from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE
 from chronoscene.cli.output import emit, report_written, say, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
-from chronoscene.figures.canvas import rgb_of, short_name
-from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
+from chronoscene.figures.canvas import short_name
+from chronoscene.figures.change_map import ChangePanel, colors_of, draw_changes
 from chronoscene.figures.cloud import cloud_of
 from chronoscene.formats.shared.ply import write_vertices
 from chronoscene.harness.use.change_scores import changes_csv, changes_table, map_run
@@ -126,11 +126,10 @@ def parse_pair(labels: Sequence[str], names: Sequence[str]) -> tuple[int, int]:
 
 def _write_cloud(path: Path, made: ChangeMap) -> None:
     """Places with the colours of their classes, scores, and the period of their surface."""
-    palette = np.array([rgb_of(color) for color in COLORS.values()]).astype(np.uint8)
     write_vertices(
         path,
         made.xyz,
-        palette[made.classes],
+        colors_of(made.classes),
         geometry=made.geometry.astype(np.float32),
         appearance=made.appearance.astype(np.float32),
         known=made.known.astype(np.uint8),

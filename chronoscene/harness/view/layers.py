@@ -12,7 +12,7 @@ import numpy as np
 from chronoscene.arrays import Array, Pixels
 from chronoscene.errors import ChronoSceneError
 from chronoscene.figures.canvas import period_colors, rgb_of
-from chronoscene.figures.change_map import COLORS
+from chronoscene.figures.change_map import colors_of
 from chronoscene.harness.use.changes import ChangeMap
 from chronoscene.harness.view.content import EXTENT, Content, vertical_fov
 from chronoscene.scene import Frame
@@ -135,6 +135,5 @@ class Layers:
                 self._changes = None
             if made is not None:
                 rows = np.isin(made.classes, CHANGED)
-                palette = np.array([rgb_of(color) for color in COLORS.values()]).astype(np.uint8)
-                colors = palette[made.classes[rows]]
+                colors = colors_of(made.classes[rows])
                 self._changes = self._add_cloud("/changes", made.xyz[rows], colors)
