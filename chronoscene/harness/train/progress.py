@@ -67,9 +67,7 @@ class ProgressDisplay:
 
     def wait(self, step: str) -> None:
         """Show a step of the run before or after its trainings."""
-        if self._task is not None:
-            self._bar.remove_task(self._task)
-        self._task = self._bar.add_task(step, total=None, status="")
+        self._show(step, None, "")
         if not self._live:
             self._print(f"{self.label}: {step}")
 
@@ -78,11 +76,9 @@ class ProgressDisplay:
         self._name = self.label if part == "all" else f"{self.label} {part}"
         self._stop, self._loss, self._psnr, self._shown = stop, None, None, 0.0
         self._model += 1
-        if self._task is not None:
-            self._bar.remove_task(self._task)
         # The runner has named the run already, and a terminal may be 80 columns wide.
         shown = "" if part == "all" else part
-        self._task = self._bar.add_task(shown, total=1.0, status="setup")
+        self._show(shown, 1.0, "setup")
         if not self._live:
             self._print(f"{self._name}: training")
 
@@ -112,6 +108,12 @@ class ProgressDisplay:
             status = self.status(iteration, seconds, psnr)
             self._print(f"{self._name}: {progress:4.0%} {status}, {report.primitives} primitives")
         self._psnr = psnr
+
+    def _show(self, step: str, total: float | None, status: str) -> None:
+        """Replace what the bar shows."""
+        if self._task is not None:
+            self._bar.remove_task(self._task)
+        self._task = self._bar.add_task(step, total=total, status=status)
 
     def _print(self, line: str) -> None:
         self.console.print(line, highlight=False, markup=False, soft_wrap=True)
