@@ -216,6 +216,13 @@ def _of_model(run: TrainedRun, folder: Path) -> CameraSequence:
         size = evaluation_size(*camera.size, run.record.max_width)
         camera = resize_camera(camera, *size)
         viewpoints.append(Viewpoint(image_file(image.name), camera, image.cam_from_world, None))
+    if not viewpoints:
+        raise ConfigError(
+            f"--cameras {folder}",
+            expected="a model with images",
+            found="none",
+            todo="name another folder",
+        )
     return CameraSequence(tuple(viewpoints), is_path=False)
 
 

@@ -73,6 +73,13 @@ def test_a_model_of_colmap_without_distortion_and_at_most_as_wide_as_the_run(run
         with_periods(viewpoints_of(run, tmp_path), run, (), 5)
 
 
+def test_a_model_of_colmap_without_images(run, tmp_path):
+    for name, line in (("cameras", "1 PINHOLE 4 3 3 3 2 1.5"), ("images", ""), ("points3D", "")):
+        (tmp_path / f"{name}.txt").write_text(f"{line}\n")
+    with pytest.raises(ConfigError, match="expected a model with images, found none"):
+        viewpoints_of(run, tmp_path)
+
+
 def camera_path(run, **changes):
     """A path of nerfstudio through three poses of the scene, all numbers of a matrix in a row."""
     cameras = [
