@@ -17,7 +17,7 @@ from chronoscene.harness.use.trained_run import open_run
 @RUN
 @click.option(
     "--max-loss",
-    type=FiniteRange(min=0, min_open=True),
+    type=FiniteRange(min=0, max=100, min_open=True),
     default=0.1,
     help="Largest loss of PSNR on training views, in dB.",
 )

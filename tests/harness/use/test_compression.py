@@ -107,6 +107,12 @@ def test_the_loss_is_that_of_the_file_though_a_position_is_far_away(tmp_path):
     assert np.abs(stored["means"] - means).max() > 0.01
 
 
+def test_a_loss_beyond_all_images_is_a_usage_error():
+    """Its share of errors is no number that a computer has."""
+    result = CliRunner().invoke(cli, ["compress", "run", "--max-loss", "1e300"])
+    assert result.exit_code == 2 and "1e+300 is not in the range 0<x<=100" in result.output
+
+
 def test_a_loss_means_nothing_to_the_plain_form(trained):
     with pytest.raises(ConfigError, match="--max-loss: expected none with --plain"):
         compress(trained["chronogs"], "--plain", "--max-loss", "0.5")
