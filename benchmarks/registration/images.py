@@ -84,6 +84,8 @@ CASES = (
     ImageCase("street, then to the side", 45, kind="street", views=156, passes=(0.0, 90.0)),
     ImageCase("street, then diagonally", 45, kind="street", views=156, passes=(0.0, 45.0)),
     ImageCase("street, half rebuilt, dark", 42, kind="street", rebuilt=0.5, gamma=1.6),
+    ImageCase("forward-facing, two periods", 46, kind="facing", views=24, gps=False),
+    ImageCase("forward-facing, half rebuilt", 47, kind="facing", views=24, rebuilt=0.5, gps=False),
     ImageCase("other place", 43, other_place=True),
     ImageCase("other place, no GPS", 44, other_place=True, gps=False),
 )

@@ -43,6 +43,7 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.tracks import track_owners
 
 BADLY_PLACED = 4.0  # Pixels; transfers whose point is less certain than this are ignored
+ONE_LENS = 0.05  # Focal lengths that differ by a larger share are taken for those of two lenses
 AGREES = 3.0  # Pixels within which a held-out observation agrees with the registration
 
 
@@ -117,6 +118,8 @@ class PairFigures:
     """By held-out tracks and the surfaces together."""
     by_surfaces: tuple[Interval, Interval] | None = None
     """By the surfaces alone."""
+    focal_gap: float | None = None
+    """Percent by which their focal lengths differ, if photos of one size have one lens."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,7 +279,20 @@ def _pair(
         localised_b=localise(of_b, evidence.ties_placed[a]),
         localised_a=localise(of_a, evidence.ties_placed[b]),
         surfaces=surfaces,
+        focal_gap=_focal_gap(model, a, b),
     )
+
+
+def _focal_gap(model: Registered, a: int, b: int) -> float | None:
+    """Largest difference of the focal lengths of two periods over sizes of photos, percent."""
+    focals: dict[tuple[int, int], tuple[list[float], list[float]]] = {}
+    for camera, period in zip(model.cameras, model.periods, strict=True):
+        if period in (a, b):
+            size = focals.setdefault((camera.width, camera.height), ([], []))
+            size[int(period == b)].append(camera.K[0, 0])
+    gaps = [abs(np.log(np.median(x) / np.median(y))) for x, y in focals.values() if x and y]
+    gaps = [gap for gap in gaps if gap < ONE_LENS]
+    return 100 * float(max(gaps)) if gaps else None
 
 
 def _motionless(

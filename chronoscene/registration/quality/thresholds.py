@@ -142,6 +142,15 @@ THRESHOLDS: dict[str, Threshold] = {
         why="the points of each period must place the images of the other correctly",
         todo=LOOK,
     ),
+    "focal_gap": Threshold(
+        what="difference between the focal lengths of two periods whose cameras look one way from "
+        "nearly one place",
+        unit="%", doubtful=0.2,
+        why="there, a camera that stands further back with a longer lens sees nearly the same, so "
+        "an error of the focal length moves it by that share of the depth",
+        todo="if the lens and its focus were the same, run again with --calibration shared; else "
+        "calibrate it (--cameras), or photograph from the sides as well",
+    ),
     "clouds": Threshold(
         what="shift between the surfaces of two periods, if its interval excludes 0",
         unit="% of extent", doubtful=0.15,

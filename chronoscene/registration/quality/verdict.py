@@ -182,6 +182,8 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
     for found in (pair.localised_b, pair.localised_a):
         if isinstance(found, Localisation) and found.images >= 3:
             yield from _check("localised", _localised(found, certificate), place)
+    if certificate.facing and pair.focal_gap is not None:
+        yield from _check("focal_gap", pair.focal_gap, place)
     if isinstance(pair.surfaces, SurfaceDistance):
         shift = pair.surfaces.shift
         shifted = shift.low > 0

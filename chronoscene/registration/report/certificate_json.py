@@ -107,6 +107,8 @@ def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure
     yield Figure("hull of the tie points, of the overlap", 100 * ties.hull, "%", "ground plan")
     yield Figure(f"images of {names[0]} that see ties", 100 * ties.tied_a, "%", "its images")
     yield Figure(f"images of {names[1]} that see ties", 100 * ties.tied_b, "%", "its images")
+    if pair.focal_gap is not None:
+        yield Figure("difference of the focal lengths", pair.focal_gap, "%", "photos of one size")
     yield from _held_out_figures(pair.held_out, unit)
     for name, found in (
         ("by held-out tracks", pair.misalignment),

@@ -33,6 +33,7 @@ from chronoscene.registration.quality.thresholds import THRESHOLDS
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.report.certificate_json import pair_figures, period_figures, to_json
 from chronoscene.registration.result import HeldOutTracks, Registered
+from chronoscene.scene import Camera
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3
 
@@ -153,6 +154,24 @@ def test_gross_errors_fail() -> None:
     for change in ({"rotation": 1.0}, {"shift": 4.0}, {"by_gps": True}):
         made = generate_case(CaseSettings(ties=400, seed=32, **change))  # type: ignore[arg-type]
         assert judge(certify(made.model)).level == "fail"
+
+
+@pytest.mark.parametrize(
+    ("longer", "wider", "gap"), [(1.0, 0, 0.0), (1.009, 0, 0.896), (1.06, 0, None), (1.0, 2, None)]
+)
+def test_focal_lengths_of_one_lens_are_compared(
+    good: Registered, longer: float, wider: int, gap: float | None
+) -> None:
+    def second(camera: Camera) -> Camera:
+        fx, fy, *rest = camera.params
+        params = (fx * longer, fy * longer, *rest)
+        return replace(camera, params=params, width=camera.width + wider)
+
+    cameras = tuple(
+        second(c) if p == 1 else c for c, p in zip(good.cameras, good.periods, strict=True)
+    )
+    found = certify(replace(good, cameras=cameras)).pairs[0].focal_gap
+    assert found == (gap if gap is None else pytest.approx(gap, abs=1e-3))
 
 
 def test_nothing_in_common_is_a_fail_that_says_so() -> None:

@@ -253,6 +253,10 @@ LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
         "localised", "fail",
         lambda c, x: with_part(c, "localised_b", centre_excess=beyond(5.0, x)), 0.999, 1.001,
     ),
+    "focal_gap": (
+        "focal_gap", "doubtful",
+        lambda c, x: with_pair(replace(c, facing=True), focal_gap=x), 0.199, 0.201,
+    ),
     "clouds": (
         "clouds", "doubtful",
         lambda c, x: with_part(c, "surfaces", shift=Interval(x, 0.01, 0.2)), 0.0749, 0.0751,
@@ -453,6 +457,10 @@ def test_an_error_that_surfaces_do_not_share_is_no_failure() -> None:
     assert judge(wrong).level == "fail"
     both = (Interval(0.05, 0.0, 0.08), Interval(0.05, 0.0, 0.08))
     assert judge(with_pair(wrong, by_ties_and_surfaces=both)).level == "pass"
+
+
+def test_focal_lengths_of_dates_may_differ_where_cameras_surround_the_scene() -> None:
+    assert judge(with_pair(made(), focal_gap=3.0)).level == "pass"
 
 
 def test_forward_facing_captures_need_a_margin() -> None:
