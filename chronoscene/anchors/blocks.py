@@ -138,8 +138,8 @@ class BlockStatistics(AnchorCounters):
             period: Of the view.
             gradient: Of the loss, with respect to their blocks. [M, Fv]
             drawn: Whether any of an anchor's Gaussians is switched on. bool [M]
-            loss: The mean over the pixels.
-            pixels: How many there are.
+            loss: The mean over the pixels that count.
+            pixels: How many these are.
         """
         scale = pixels / (2 * gradient.shape[1] * max(loss, _LEAST_LOSS) ** 2)
         self.rise[anchors, period] += scale * gradient.square().sum(1)

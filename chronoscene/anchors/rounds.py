@@ -98,6 +98,8 @@ class DensityControl:
         if self.block_statistics is None:
             self.block_statistics = self._new_block_statistics()
         visible, pixels = drawn.visible, drawn.view.width * drawn.view.height
+        if drawn.mask is not None:
+            pixels = int(drawn.mask.sum())
         shown = torch.zeros(len(visible), dtype=torch.bool, device=visible.device)
         shown[drawn.positions // self.optimizer.model.layout.offsets] = True
         if (gradient := drawn.block_gradient) is not None:

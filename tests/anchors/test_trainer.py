@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.training.generated import make, training_set
+from chronoscene.anchors.blocks import BlockStatistics
 from chronoscene.anchors.optimizer import AnchorOptimizer
 from chronoscene.anchors.trainer import AnchorTrainer, Drawn
 from chronoscene.kernels import side_by_side
@@ -146,6 +147,20 @@ def test_views_that_are_skipped_take_no_part(monkeypatch: pytest.MonkeyPatch) ->
             results.append(learned(trainer, patch))
     assert results[0].keys() == results[1].keys()
     assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
+
+
+def test_blocks_count_the_pixels_of_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loss of a view is a mean over the pixels that count, so they are what is counted."""
+    counted: list[int] = []
+    monkeypatch.setattr(BlockStatistics, "update", lambda *_, pixels, **__: counted.append(pixels))
+    trainer = trainer_of(merge_share=0.01)
+    half = np.arange(30 * 40).reshape(30, 40) < 600
+    for mask in (None, half, np.ones_like(half)):
+        trainer.train = replace(trainer.train, load_mask=lambda i, mask=mask: mask)
+        trainer.photos = PhotosOnDevice(trainer.train, torch.device("cpu"))
+        counted.clear()
+        trainer.step(30, 0.3)
+        assert counted == 4 * [600 if mask is half else 1200]
 
 
 def test_anchors_move_before_a_round() -> None:
