@@ -61,7 +61,7 @@ class AdaptorNetwork(FieldNetwork):
         return int(number or 0) >= self.trained_from
 
     def density(self, places: Tensor, groups: Groups, geometry: Tensor) -> tuple[Tensor, Tensor]:
-        """Return densities, and features with the change of the latest adaptor. [N, F + 1]"""
+        """Return densities; features, and the change by the latest adaptor of a ray. [N, F + 1]"""
         none = geometry[:, :0]
         features = self.mlp("density", self.encode(places), none, groups)
         mask = features.new_zeros(len(places), 1)
@@ -73,9 +73,10 @@ class AdaptorNetwork(FieldNetwork):
             code = self.encode_with(f"table_{i + 1}", places)
             own = self.mlp(f"expert_{i + 1}", code, none, groups)
             share = self.mlp(f"mask_{i + 1}", code, none, groups, "sigmoid")
-            share = share * gates.index_select(0, groups.of_row)
+            gate = gates.index_select(0, groups.of_row)
+            share = share * gate
             features = features + share * (own - features)
-            mask = torch.where(gates.any(), share, mask)
+            mask = torch.where(gate > 0, share, mask)
         return truncated_exp(features[:, 0] + SHIFT), torch.cat((features, mask), dim=1)
 
     def values(

@@ -12,6 +12,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.fields.method import Drawn
 from chronoscene.fields.mlp import make_groups
 from chronoscene.harness.contract.tiny_training import make_stage
+from chronoscene.harness.train.painted_balls import make_training_set
 from chronoscene.methods import build_config, import_object, load_spec
 
 SMALL = {"samples": 2_048, "levels": 4, "log2_rows": 12, "finest": 64, "hidden": 16, "cells": 16}
@@ -64,6 +65,21 @@ def test_the_adaptors_of_a_period_are_those_up_to_it() -> None:
     names = {name for name in method.network.params if name.startswith("table")}
     assert names == {"table", "table_1", "table_2"}
     assert [method.network._learns(name) for name in ("table_1", "mask_2", "color")] == [0, 1, 0]
+
+
+def test_the_change_of_a_ray_is_of_its_own_period() -> None:
+    """Rays of several periods in one step, as under joint, each give what they give alone."""
+    method = begun()
+    method.setup(make_training_set(3), seed=0, device="cpu")
+    places = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * 0.9
+    gates = method.gates(torch.arange(3.0))
+    network, rays = method.network, make_groups(torch.tensor([0, 20, 40, 60]))
+    together = network.density(places, rays, gates)[1][:, -1]
+    for i in range(3):
+        part, ray = places[20 * i : 20 * (i + 1)], make_groups(torch.tensor([0, 20]))
+        alone = network.density(part, ray, gates[i : i + 1])[1][:, -1]
+        assert torch.allclose(together[20 * i : 20 * (i + 1)], alone, atol=1e-6)
+        assert bool((alone > 0).all()) == (i > 0)
 
 
 def test_earlier_views_are_shown_as_views_of_the_new_period() -> None:
