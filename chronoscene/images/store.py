@@ -106,6 +106,7 @@ class ImageStore:
         memory_limit: int = 2 * 1024**3,
         decoders: int = 1,
         disk: DiskCache | None = None,
+        fixed: bool = False,
     ) -> None:
         """Set up the store; decode nothing yet.
 
@@ -116,6 +117,7 @@ class ImageStore:
                 decoding takes comes on top.
             decoders: Threads that decode ahead; they start with the first call of `expect`.
             disk: Keeps decoded images for the next time; None to decode them again.
+            fixed: Refuse files that change from now on, when they are read.
         """
         self.waited = 0.0
         """Seconds that callers waited for images that were not in memory."""
@@ -129,6 +131,8 @@ class ImageStore:
         self._ahead = AHEAD * decoders
         self._decoders = ThreadPoolExecutor(decoders, "decoder")
         self._coming: dict[str, Future[Photo]] = {}
+        files = [p for f in scene.frames for p in _files(scene, f)] if fixed else []
+        self._stamps = {path: _stamp(path) for path in files}
 
     @property
     def cached_bytes(self) -> int:
@@ -147,6 +151,7 @@ class ImageStore:
 
         Raises:
             ImageError: If the file or its mask is missing or damaged.
+            SceneError: If one of them has changed, in a store of fixed files.
         """
         return self._photo(frame)[0]
 
@@ -194,10 +199,21 @@ class ImageStore:
         path, mask_path = self._scene.image_path(frame), self._scene.masks.get(frame.name)
         try:
             image, mask = self._load(path, mask_path, size=size)
+            self._check_unchanged(frame)
             return self._keep(frame.name, (_mapped(image), None if mask is None else _mapped(mask)))
         finally:
             with self._lock:
                 self._coming.pop(frame.name, None)
+
+    def _check_unchanged(self, frame: Frame) -> None:
+        for path in _files(self._scene, frame) if self._stamps else ():
+            if _stamp(path) != self._stamps[path]:
+                raise SceneError(
+                    path,
+                    expected="a file that stays as it was when the run began",
+                    found="a later change",
+                    todo="run the same command again, which plans with the present files",
+                )
 
     def _keep(self, name: str, photo: Photo) -> Photo:
         """Put a photo into the cache; another thread may have been faster."""
@@ -211,6 +227,21 @@ class ImageStore:
             while self._bytes > self._limit:
                 self._bytes -= _bytes(self._cache.popitem(last=False)[1])
         return photo
+
+
+def _files(scene: Scene, frame: Frame) -> list[Path]:
+    """Return the image of a frame, and its mask if it has one."""
+    mask = scene.masks.get(frame.name)
+    return [scene.image_path(frame), *([] if mask is None else [mask])]
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Return size and time of change of a file; None if it is not there."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns
 
 
 def _mapped(array: NDArray[Any]) -> NDArray[Any]:

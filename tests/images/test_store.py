@@ -1,5 +1,6 @@
 """The resize rule, scaling of cameras, and the cache."""
 
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -172,6 +173,23 @@ def test_a_damaged_image_of_a_scene_names_its_file(scene):
         store.expect(ahead)
         with pytest.raises(ImageError, match=r"images/1\.png: expected an image that can be"):
             store.load(scene.frames[1])
+
+
+def test_files_that_change_are_refused_where_they_are_fixed(scene, tmp_path):
+    """Only when they are read again; a photo in memory is as it was."""
+    mask = tmp_path / "mask.png"
+    Image.new("L", (64, 48), 255).save(mask)
+    first, second, third = scene.frames[:3]
+    masked = replace(scene, masks={second.name: mask})
+    store, free = (ImageStore(masked, memory_limit=4 * IMAGE_BYTES, fixed=f) for f in (True, False))
+    store.load(first)
+    for path in (scene.image_path(first), mask, scene.image_path(third)):
+        os.utime(path, ns=(0, 10**18))
+    store.load(first)
+    for frame, name in ((second, "mask.png"), (third, "images/2.png")):
+        with pytest.raises(SceneError, match=rf"{name}: expected a file that stays"):
+            store.load(frame)
+        free.load(frame)
 
 
 class Decoder:

@@ -111,7 +111,7 @@ def photo_needs(scene: Scene, settings: RunSettings) -> PhotoNeeds:
 
 
 def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
-    """Open the photos of a run, within its limits."""
+    """Open the photos of a run, within its limits; files must not change from then on."""
     needs = photo_needs(scene, settings)
     disk = DiskCache(settings.runs / PHOTOS, settings.photo_disk) if needs.on_disk else None
     return ImageStore(
@@ -120,6 +120,7 @@ def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
         memory_limit=needs.allowed - needs.decoders * needs.decoding,
         decoders=needs.decoders,
         disk=disk,
+        fixed=True,
     )
 
 

@@ -66,9 +66,8 @@ def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> Non
     settings, staging = job.settings, Path(job.staging)
     write_text_atomic(staging / records.CONFIG_FILE, json.dumps(run.document, indent=1) + "\n")
     scene = job.read_scene()
-    parts = make_parts(
-        scene, ImageStore(scene, max_width=settings.max_width, memory_limit=0), job.strategy
-    )
+    store = ImageStore(scene, max_width=settings.max_width, memory_limit=0, fixed=True)
+    parts = make_parts(scene, store, job.strategy)
     write_source(staging, job.origin, parts[0].train.training_from_world)
     writer = ImageWriter(staging / records.PREDICTIONS)
     stops = run.stops(parts)

@@ -1,5 +1,6 @@
 """Photos within limits: the estimate, what is refused, results that limits do not change."""
 
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ConfigError, SceneError
 from chronoscene.harness.plan import memory as planning
 from chronoscene.harness.plan.memory import (
     check_room,
@@ -218,6 +219,14 @@ def test_limits_do_not_change_results(bench_here, tmp_path, method):
         assert (runs / "photos").exists() == (name == "little")
     assert len(list((tmp_path / "little" / "photos").iterdir())) == 5
     assert len({(f / "checkpoint" / "model.safetensors").read_bytes() for f in folders}) == 1
+
+
+def test_a_photo_that_changes_in_a_run_is_refused(make_scene, settings):
+    scene = make_scene()
+    store, path = open_store(scene, settings), scene.image_path(scene.frames[0])
+    os.utime(path, ns=(0, 10**18))
+    with pytest.raises(SceneError, match="expected a file that stays as it was when the run began"):
+        store.load(scene.frames[0])
 
 
 def test_a_training_that_goes_on_with_photos_from_disk_ends_alike(make_scene, settings, tmp_path):
