@@ -15,7 +15,7 @@ from chronoscene.checks import check_choice
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.harness.files.records import ROWS_FILE, Failure, read_with_rows
-from chronoscene.harness.plan.settings import bench_settings
+from chronoscene.harness.plan.settings import PHOTO_MEMORY, bench_settings
 from chronoscene.harness.plan.stop import parse_duration
 from chronoscene.harness.report.summary import ENTRY_COLUMNS, summarise
 from chronoscene.harness.run.runner import run_bench
@@ -212,6 +212,7 @@ def bench(
     device: str = "auto",
     threads: int | None = None,
     jobs: int | None = None,
+    photo_memory: float = PHOTO_MEMORY / 1e9,
     overwrite: bool = False,
     format: str | None = None,
     period_by: str | None = None,
@@ -241,6 +242,7 @@ def bench(
         device: ``auto``, ``cpu`` or ``cuda``.
         threads: Threads per run; None for all cores.
         jobs: Number of runs at a time; None for one.
+        photo_memory: Memory of a run for training photos in GB, the decoding of them included.
         overwrite: Replace finished runs that were made with other settings.
         format: Name of the dataset format of the scenes; None to detect it.
         period_by: Grouping of images into periods, for formats with a choice.
@@ -273,6 +275,7 @@ def bench(
         period_by=period_by,
         overwrite=overwrite,
         jobs=jobs,
+        photo_memory=round(photo_memory * 1e9),
     )
     outcome = run_bench(settings, log or (lambda line: None))
     return BenchmarkResult(outcome.finished, outcome.failures)

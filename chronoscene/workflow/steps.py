@@ -26,6 +26,7 @@ from chronoscene.errors import (
 )
 from chronoscene.harness.files.predictions import encode_png, to_bytes
 from chronoscene.harness.files.records import RUN_FILE
+from chronoscene.harness.plan.settings import PHOTO_MEMORY
 from chronoscene.harness.use.changes import usual_pairs
 from chronoscene.harness.use.export import make_file, period_files, prepare
 from chronoscene.harness.use.page import write_page
@@ -72,6 +73,8 @@ class Project:
     say: Log
     progress: Callable[[str], AbstractContextManager[Report]]
     """Show the progress of work that begins with a named part while the block runs."""
+    photo_memory: float = PHOTO_MEMORY / 1e9
+    """GB, as for `chronoscene.api.bench`; no result depends on it."""
 
     @property
     def scene(self) -> Path:
@@ -168,6 +171,7 @@ def _validate(project: Project) -> Sequence[Path]:
 def _bench(project: Project) -> Sequence[Path]:
     _check_alignment(project)
     options: dict[str, Any] = {**project.options, "log": project.say, "overwrite": True}
+    options["photo_memory"] = project.photo_memory
     result = bench(project.scene, METHOD, out=project.runs, **options)
     if result.failures:
         raise CheckpointError(

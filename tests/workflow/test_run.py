@@ -4,7 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from chronoscene.cli.runs.all import command
 from chronoscene.errors import ChronoSceneError, ConfigError, RegistrationError, SceneError
 from chronoscene.workflow import steps
 from chronoscene.workflow.run import start
@@ -172,6 +174,23 @@ def test_a_failed_alignment_is_not_trained_on(fake, monkeypatch):
     ]
     assert "page" not in fake.calls
     assert fake.states["bench"] == "failed"
+
+
+def test_the_memory_for_photos_changes_no_step(fake, monkeypatch):
+    """The training has it, and no record."""
+    asked = []
+
+    def train(scene, method, *, photo_memory, **options):
+        asked.append(photo_memory)
+        raise RegistrationError("bench", expected="time", found="none", todo="wait")
+
+    monkeypatch.setattr(steps, "bench", train)
+    monkeypatch.setattr(fake, "bench", steps._bench, raising=False)
+    for memory in (0.5, 1.5):
+        call = [str(fake.captures), str(fake.out), "--photo-memory", str(memory)]
+        with pytest.raises(RegistrationError):
+            CliRunner().invoke(command, call, catch_exceptions=False)
+    assert asked == [0.5, 1.5] and fake.calls.count("register") == 1
 
 
 def test_runs_in_one_folder_share_scene_and_width(fake, monkeypatch):

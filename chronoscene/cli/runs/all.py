@@ -10,7 +10,7 @@ import click
 from chronoscene.cli.options import PATH, TABLE, add_options
 from chronoscene.cli.output import check_place, report_written, say
 from chronoscene.cli.progress import progress_bar
-from chronoscene.cli.runs.bench import BUDGET, WIDTH
+from chronoscene.cli.runs.bench import BUDGET, MEMORY, WIDTH
 from chronoscene.workflow.run import run_steps, start
 from chronoscene.workflow.steps import Project
 
@@ -22,7 +22,10 @@ from chronoscene.workflow.steps import Project
 @add_options("preset")
 @BUDGET
 @WIDTH
-def command(captures: Path, out: Path, table: Path | None, **options: Any) -> None:
+@MEMORY
+def command(
+    captures: Path, out: Path, table: Path | None, photo_memory: float, **options: Any
+) -> None:
     """Make a scene, a model, a page and products from photos.
 
     CAPTURES is what register takes: for example, a folder with a subfolder of photos for each
@@ -38,5 +41,6 @@ def command(captures: Path, out: Path, table: Path | None, **options: Any) -> No
     record, changes = start(captures, table, out, options)
     if changes:
         say(changes)
-    page = run_steps(Project(captures, table, out, options, record, say, progress_bar))
+    project = Project(captures, table, out, options, record, say, progress_bar, photo_memory)
+    page = run_steps(project)
     report_written(page)

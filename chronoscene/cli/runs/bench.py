@@ -48,6 +48,12 @@ WIDTH = click.option(
     default=MAX_WIDTH,
     help="Scale wider images down to this width in pixels, for training and evaluation.",
 )
+MEMORY = click.option(
+    "--photo-memory",
+    type=FiniteRange(min=0),
+    default=PHOTO_MEMORY / 1e9,
+    help="Memory for training photos in GB, the decoding of them included.",
+)
 
 
 @click.command("bench")
@@ -99,12 +105,7 @@ WIDTH = click.option(
     "are per period]",
 )
 @WIDTH
-@click.option(
-    "--photo-memory",
-    type=FiniteRange(min=0),
-    default=PHOTO_MEMORY / 1e9,
-    help="Memory for training photos in GB, the decoding of them included.",
-)
+@MEMORY
 @click.option(
     "--photo-disk",
     type=FiniteRange(min=0),

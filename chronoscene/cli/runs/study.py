@@ -16,7 +16,7 @@ from chronoscene.cli.options import (
     training_options,
 )
 from chronoscene.cli.output import emit, say, terminal_width
-from chronoscene.cli.runs.bench import BUDGET, SOME_FAILED, WIDTH, settings_from
+from chronoscene.cli.runs.bench import BUDGET, MEMORY, SOME_FAILED, WIDTH, settings_from
 from chronoscene.harness.study.plan import find_study, read_study, run_study
 from chronoscene.harness.study.tables import study_texts
 
@@ -30,6 +30,7 @@ ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 @training_options
 @BUDGET
 @WIDTH
+@MEMORY
 @LPIPS_WEIGHTS
 @RUNS_OUT
 def command(name: str, seeds: int, out: Path, **options: Any) -> None:

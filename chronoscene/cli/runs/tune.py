@@ -9,7 +9,7 @@ import click
 
 from chronoscene.cli.options import FOLDER, SCENES, add_options, look_here_for, reading_options
 from chronoscene.cli.output import emit, report_written, say, terminal_width
-from chronoscene.cli.runs.bench import settings_from
+from chronoscene.cli.runs.bench import MEMORY, settings_from
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.tune.report import PRESET_FILE, TRIALS_FILE, trials_table
 from chronoscene.harness.tune.search import tune
@@ -33,6 +33,7 @@ from chronoscene.io.tables import boxed_text
 )
 @reading_options("the scenes")
 @add_options("preset", "iterations", "jobs", "job_memory", "ray", "threads", "device")
+@MEMORY
 @click.option("--out", type=FOLDER, required=True, help="Folder for the search.")
 def command(
     method: str, trials: int, seed: int, strategy: str | None, out: Path, **options: Any

@@ -191,7 +191,7 @@ def _check_memory(needs: PhotoNeeds, training: int, free: int | None) -> None:
             f"{needs.scene}: memory for photos",
             expected=f"at least {_gb(least)} to decode photos of {width} x {height} pixels",
             found=_gb(needs.allowed),
-            todo=f"scale the photos down, or use bench --photo-memory {enough}",
+            todo=f"scale the photos down, or use --photo-memory {enough}",
         )
     wanted = needs.in_memory + training
     if free is not None and free < wanted:
@@ -200,7 +200,7 @@ def _check_memory(needs: PhotoNeeds, training: int, free: int | None) -> None:
             needs.scene,
             expected=f"{_gb(wanted)} of memory, {_gb(needs.in_memory)} of it for photos",
             found=f"{_gb(free)} free",
-            todo=f"end other programs, or use bench --photo-memory {smaller}"
+            todo=f"end other programs, or use --photo-memory {smaller}"
             if smaller * 1e9 >= least
             else "end other programs, or use a machine with more memory",
         )

@@ -41,7 +41,7 @@ def test_a_study_of_ones_own(make_scene_folder, tmp_path, runs_here):
     assert (runs / "study-rates.csv").read_text().startswith("row,source,scene,")
 
 
-def test_budget_and_width_are_options(make_scene_folder, tmp_path, monkeypatch):
+def test_budget_width_and_memory_are_options(make_scene_folder, tmp_path, monkeypatch):
     asked = []
 
     def run(study, settings, log):
@@ -52,8 +52,10 @@ def test_budget_and_width_are_options(make_scene_folder, tmp_path, monkeypatch):
     (tmp_path / "rates.toml").write_text(STUDY)
     scene = make_scene_folder(IMAGES)
     call = ("study", tmp_path / "rates.toml", scene, "--budget", "1m", "--max-width", 320)
+    call += "--photo-memory", 0.5
     CliRunner().invoke(cli, [str(word) for word in call], catch_exceptions=False)
-    assert [(run.budget_seconds, run.max_width) for run in asked] == [(60.0, 320)]
+    found = [(run.budget_seconds, run.max_width, run.photo_memory) for run in asked]
+    assert found == [(60.0, 320, 500_000_000)]
 
 
 def test_mistakes_are_one_line(make_scene_folder, tmp_path):

@@ -41,5 +41,8 @@ def test_mistakes_are_one_line(make_scene_folder, tmp_path):
     )
     assert done.exit_code == 2 and len(done.stderr.splitlines()) == 1
     assert "a method with a search space, found none" in done.stderr
+    out = "--trials", 1, "--out", tmp_path / "tuned"
+    done = chronoscene("tune", "3dgs", scene, "--photo-memory", 0, *out)
+    assert done.exit_code == 2 and "memory for photos: expected at least" in done.stderr
     done = chronoscene("tune", "3dgs", scene, "--trials", 1, "--out", scene / "tuned")
     assert done.exit_code == 2 and "--out" in done.stderr and "Traceback" not in done.stderr

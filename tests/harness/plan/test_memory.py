@@ -157,7 +157,7 @@ def test_too_little_memory_for_one_photo_is_refused_with_what_is_enough(make_sce
     scene = big(make_scene())
     assert refusal(scene, settings) == (
         "ring: memory for photos: expected at least 0.51 GB to decode photos of 6000 x 4000 "
-        "pixels, found 0.00 GB; scale the photos down, or use bench --photo-memory 0.51"
+        "pixels, found 0.00 GB; scale the photos down, or use --photo-memory 0.51"
     )
     settings.photo_memory = 510_000_000
     room(scene, settings, runs=1)
@@ -171,7 +171,7 @@ def test_more_than_is_free_is_refused_with_a_smaller_setting(make_scene, setting
     free(7_390_000_000, 10**12)
     assert refusal(scene, settings) == (
         "ring: expected 7.40 GB of memory, 0.90 GB of it for photos, found 7.39 GB free; "
-        "end other programs, or use bench --photo-memory 0.89"
+        "end other programs, or use --photo-memory 0.89"
     )
     free(7_330_000_000, 10**12)
     assert refusal(scene, settings).endswith(
