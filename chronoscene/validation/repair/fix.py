@@ -21,6 +21,7 @@ from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_test_text
 from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.names import spelling
+from chronoscene.validation.folder.pixels import read_headers
 from chronoscene.validation.folder.scene_folder import RawScene, TextFile, read_text_file
 from chronoscene.validation.repair import contents
 from chronoscene.validation.repair.contents import Repair
@@ -74,6 +75,8 @@ class _Fix:
         self._repairs: list[Repair] = []
         self._written: set[str] = set()
         """Files that must not be copied: they were written, moved or left out."""
+        self._renamed: dict[str, str] = {}
+        """Files of images that got another name, by that name."""
 
     def run(self) -> list[Repair]:
         self._model()
@@ -181,7 +184,6 @@ class _Fix:
         """Rename files whose name differs from that in the model only by its `spelling`."""
         registered, present = set(self._scene.names), set(self._scene.present)
         by_spelling = grouped((spelling(file), file) for file in self._scene.files)
-        renamed = []
         for name in sorted(registered - present):
             files = by_spelling.get(spelling(name), [])
             if len(files) == 1 and files[0] not in registered and self._inside(files[0]):
@@ -191,28 +193,34 @@ class _Fix:
                 if (self._scene.root / mask).is_file():
                     self._written.add(mask)
                     _link(self._scene.root / mask, self._out / mask_place(name))
-                renamed.append(name)
-        if renamed:
-            what = f"{counted(len(renamed), 'image')} renamed as in the model: {shown(renamed)}"
+                self._renamed[name] = files[0]
+        if names := list(self._renamed):
+            what = f"{counted(len(names), 'image')} renamed as in the model: {shown(names)}"
             self._repairs.append(Repair("CS201", what))
 
     def _orientation_tags(self) -> None:
         """Reset tags that rotate images in viewers: the poses refer to the pixels as stored."""
-        headers = self._scene.headers
+        moved = read_headers(self._scene.root / "images", list(self._renamed.values()))
+        headers = self._scene.headers | {new: moved[old] for new, old in self._renamed.items()}
         turned = {n for n, h in headers.items() if h.problem is None and h.orientation > 1}
-        done = []
-        for name in sorted(turned - images_of_other_shape(self._scene)) if turned else ():
-            source = self._scene.image_path(name)
-            upright = set_upright(source.read_bytes()) if self._inside(name) else None
+        done = set()
+        for name in sorted(turned - images_of_other_shape(self._scene, headers)) if turned else ():
+            file = self._renamed.get(name, name)
+            source = self._scene.image_path(file)
+            upright = set_upright(source.read_bytes()) if self._inside(file) else None
             if upright is not None:
                 target = self._out / "images" / name
                 target.parent.mkdir(parents=True, exist_ok=True)
+                target.unlink(missing_ok=True)  # a renamed file is a link to the original
                 target.write_bytes(upright)
                 self._written.add(f"images/{name}")
-                done.append(name)
+                done.add(name)
         if done:
-            what = f"orientation tag of {counted(len(done), 'image')} set to upright: {shown(done)}"
-            self._repairs.append(Repair("CS207", what))
+            names = shown(sorted(done))
+            what = f"orientation tag of {counted(len(done), 'image')} set to upright: {names}"
+            # The rule does not see files of other names.
+            code = "CS207" if done - self._renamed.keys() else ""
+            self._repairs.append(Repair(code, what))
 
     def _inside(self, name: str) -> bool:
         images = (self._scene.root / "images").resolve()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import PurePosixPath
 
 from chronoscene.colmap.raw_model import RawImages
@@ -116,17 +116,26 @@ def image_size(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"images/{name}", _expected(camera), f"{size[0]} x {size[1]}")
 
 
-def images_of_other_shape(scene: RawScene) -> set[str]:
-    """Names of the images whose aspect ratio is not that of their camera."""
-    return {name for name, size, camera in _sizes(scene) if not _same_shape(size, camera)}
+def images_of_other_shape(scene: RawScene, headers: Mapping[str, Header] | None = None) -> set[str]:
+    """Names of the images whose aspect ratio is not that of their camera.
+
+    Args:
+        scene: The scene.
+        headers: Of images, by their names in the model; None for those that are present.
+    """
+    sizes = _sizes(scene, headers)
+    return {name for name, size, camera in sizes if not _same_shape(size, camera)}
 
 
-def _sizes(scene: RawScene) -> Iterator[tuple[str, tuple[int, int], Camera]]:
+def _sizes(
+    scene: RawScene, headers: Mapping[str, Header] | None = None
+) -> Iterator[tuple[str, tuple[int, int], Camera]]:
     """Name, size of the file, and camera of the images that have both."""
     assert scene.images is not None
+    headers = scene.headers if headers is None else headers
     cameras = scene.usable_cameras
     for name, camera_id in zip(scene.images.names, scene.images.camera_ids.tolist(), strict=True):
-        header = scene.headers.get(name)
+        header = headers.get(name)
         if header is not None and header.problem is None and camera_id in cameras:
             yield name, header.size, cameras[camera_id]
 

@@ -315,6 +315,24 @@ def test_orientation_tag(scene, fix, order):
         assert new.getexif()[0x010F] == "Maker"
 
 
+def test_orientation_tag_of_a_misspelt_image(scene, fix):
+    """One pass is enough for both, and the original keeps its bytes."""
+    scene.save("a000.png", Image.new("RGB", (64, 48)), as_name="a000.jpg")
+    scene.save("a001.png", Image.new("RGB", (64, 48)), as_name="a001.jpg")
+    scene.save("a002.png", Image.new("RGB", (48, 64)))  # has the error that a001.jpg will have
+    for name, size in (("a000.jpg", (64, 48)), ("a001.jpg", (48, 64))):
+        scene.path(f"images/{name}").unlink()
+        scene.write(f"images/{name.upper()}", tagged(Image.new("RGB", size), 6))
+    before = scene.path("images/A000.JPG").read_bytes()
+    fixed, after, out = fix()
+    assert fixed == {"CS201"} and after == {"CS204", "CS507"}
+    assert not (out / "images/A000.JPG").exists()
+    for name, tag in (("a000.jpg", 1), ("a001.jpg", 6)):
+        with Image.open(out / "images" / name) as image:
+            assert image.getexif().get(0x0112, 1) == tag
+    assert scene.path("images/A000.JPG").read_bytes() == before
+
+
 def test_orientation_tag_that_the_camera_agrees_with_stays(scene, fix):
     scene.save("a000.png", Image.new("RGB", (64, 48)), as_name="a000.jpg")
     scene.write("images/a000.jpg", tagged(Image.new("RGB", (48, 64)), 6))
