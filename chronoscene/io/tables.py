@@ -190,6 +190,12 @@ def markdown(table: Table, *, special: str = r"\`*<>|[]") -> str:
     return "\n".join(lines) + "\n"
 
 
+def markdown_list(lines: Iterable[str]) -> str:
+    """Format plain lines as a list, in which nothing of them is markup."""
+    texts = (escape_markdown(printable(line), special=r"\`*<>_[") for line in lines)
+    return "".join(f"- {text}\n" for text in texts)
+
+
 def _piped(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 

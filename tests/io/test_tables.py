@@ -13,6 +13,7 @@ from chronoscene.io.tables import (
     escape_latex,
     latex,
     markdown,
+    markdown_list,
     plain_text,
     text_of,
 )
@@ -47,6 +48,12 @@ def test_markdown():
         r"| \[c | **30.5** | 4 |",
     ]
     assert r"a\_b" in markdown(TABLE, special="_")
+
+
+def test_a_list_has_no_markup_of_its_own():
+    """Nor check boxes, as which an item that begins with [ ] is shown."""
+    text = markdown_list(["failed: <b>a_b</b>\nof *c*", "[ ]: `d`"])
+    assert text == "- failed: \\<b\\>a\\_b\\</b\\>\\\\nof \\*c\\*\n- \\[ ]: \\`d\\`\n"
 
 
 @pytest.mark.parametrize("style", ["table", "markdown", "latex"])

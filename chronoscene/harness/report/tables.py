@@ -164,8 +164,9 @@ def tables_text(
         width: Characters of the terminal that ``table`` goes to; None for no limit.
     """
     if style == "markdown":
-        texts, bullet = [tables.markdown(t, special=r"\`*<>|_") for t in made], "- "
-    elif style == "latex":
+        texts = [tables.markdown(table, special=r"\`*<>|_") for table in made]
+        return "\n".join([*texts, tables.markdown_list(notes)])
+    if style == "latex":
         texts, bullet = [tables.latex(table, cmidrules=True) for table in made], "% "
     else:
         texts, bullet = [tables.boxed_text(table, width=width) for table in made], ""

@@ -236,11 +236,11 @@ def study_texts(
         "directions": sentences,
         "notes": notes,
     }
-    bullets = "".join(f"- {line}\n" for line in (*sentences, *notes))
     lines = "".join(f"{line}\n" for line in (*sentences, "", *notes))
     return {
         "table": f"{study.question}\n\n{tables.boxed_text(table, width=width)}\n{lines}",
-        "markdown": f"{study.question}\n\n{tables.markdown(table)}\n{bullets}",
+        "markdown": f"{study.question}\n\n{tables.markdown(table)}\n"
+        + tables.markdown_list([*sentences, *notes]),
         "csv": str(listed.to_csv(index=False, lineterminator="\n")),
         "json": json.dumps(document, indent=1, allow_nan=False) + "\n",
     }

@@ -245,6 +245,12 @@ def test_many_periods_are_folded():
     assert len(grids(eight, ["psnr"])[0].heads) == 1 + 8 + 3 + 1
 
 
+def test_notes_in_markdown_have_no_markup_of_their_own():
+    run = record().model_copy(update={"notices": ["<img src=x> of a_b"]})
+    assert "\n- \\<img src=x\\> of a\\_b\n" in format_runs([run], [], "markdown", ["psnr"])
+    assert "\n<img src=x> of a_b\n" in format_runs([run], [], "table", ["psnr"])
+
+
 def test_published_rows_stand_below_the_measured_ones_and_are_never_marked():
     runs = [run.model_copy(update={"scene": "Lawncourt"}) for run in RUNS]
     runs.append(record("3dgs", psnr=(9.0, 9.0), scene="plaza", strategy="pooled"))

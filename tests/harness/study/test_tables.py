@@ -119,7 +119,8 @@ def test_every_format_has_measured_and_published_figures(runs, tmp_path):
         for folder, run in zip(finished[label], records, strict=True):
             folder.mkdir()
             write_run(folder, run, run.rows)
-    texts = study_texts(STUDY, finished, [])
+    texts = study_texts(STUDY.model_copy(update={"notes": (*STUDY.notes, "<b>")}), finished, [])
+    assert "\n- \\<b\\>\n" in texts["markdown"] and "\n<b>\n" in texts["table"]
     lines = texts["markdown"].splitlines()
     assert lines[0] == "What does it lose without a part?"
     head, full, a = (line for line in lines if line.startswith(("| scene", "| plaza | full")) or
@@ -130,7 +131,7 @@ def test_every_format_has_measured_and_published_figures(runs, tmp_path):
     assert "| 24.50 (\N{MINUS SIGN}0.50) |" in a
     for text in (texts["markdown"], texts["table"]):
         assert "published: A paper, table 3" in text and "parts are left out one by one" in text
-        assert "plaza, without a: in PSNR [dB] the direction agrees" in text
+        assert "plaza, without a: in PSNR [dB] the direction agrees" in text.replace("\\", "")
 
     entries = json.loads(texts["json"])["entries"]
     by_key = {(e["source"], e["row"], e["quantity"]): e for e in entries}
