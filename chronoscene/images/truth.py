@@ -44,6 +44,28 @@ def truth_place(kind: Kind, view: str, other: int | None = None) -> str:
     return f"{kind}/{PurePosixPath(view).with_suffix('')}{period}{SUFFIXES[kind]}"
 
 
+def check_distinct(truth: Path, views: Iterable[str]) -> None:
+    """Refuse views whose files of the truth have one name, if there is a truth.
+
+    Args:
+        truth: Its folder.
+        views: Names of frames.
+
+    Raises:
+        ImageError: If two differ in their extension only.
+    """
+    known: dict[str, str] = {}
+    for view in views if truth.is_dir() else ():
+        other = known.setdefault(truth_place("depth", view), view)
+        if other != view:
+            raise ImageError(
+                truth,
+                expected="views whose names differ without their extension",
+                found=f"{other} and {view}, which share their files here",
+                todo="rename one of the two images in the scene",
+            )
+
+
 def load_changes(path: Path, size: tuple[int, int], max_width: int) -> NDArray[np.uint8]:
     """Read a change mask at the size of the evaluation. [H, W]
 

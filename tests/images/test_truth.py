@@ -10,6 +10,7 @@ from chronoscene.images.truth import (
     GEOMETRY,
     UNCHANGED,
     changed_at_all,
+    check_distinct,
     load_changes,
     load_depth,
     load_other,
@@ -28,6 +29,13 @@ def test_places():
     assert truth_place("change", "a/x.1.jpg", 2) == "change/a/x.1__p2.png"
     assert truth_place("cross_rgb", "x.jpg", 10) == "cross_rgb/x__p10.jpg"
     assert truth_place("depth", "x.jpg") == "depth/x.npz"
+
+
+def test_views_that_share_their_files_are_refused(tmp_path):
+    check_distinct(tmp_path / "none", ["a/x.jpg", "a/x.png"])
+    check_distinct(tmp_path, ["a/x.jpg", "b/x.jpg", "a/y.jpg"])
+    with pytest.raises(ImageError, match=r"found a/x\.jpg and a/x\.png, which share their files"):
+        check_distinct(tmp_path, ["a/x.jpg", "b/x.jpg", "a/x.png"])
 
 
 def test_values_of_users(tmp_path):

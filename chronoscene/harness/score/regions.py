@@ -29,7 +29,7 @@ from chronoscene.harness.files.predictions import (
     write_png,
 )
 from chronoscene.harness.files.records import read_run, run_folders
-from chronoscene.images.truth import changed_at_all, truth_place
+from chronoscene.images.truth import changed_at_all, check_distinct, truth_place
 
 ALL, CHANGED, INVARIANT = REGIONS = ("all", "changed", "invariant")
 
@@ -110,6 +110,7 @@ def freeze_change_masks(runs: Path, truth: Path) -> None:
 def _freeze(frozen: Path, truth: Path, periods: list[int]) -> bool:
     """Freeze the masks of one scene; return True if there are any."""
     manifest, entries = read_manifest(frozen), []
+    check_distinct(truth, (entry.view for entry in manifest.images))
     for entry in manifest.images:
         others = [period for period in periods if period != entry.camera_period]
         size, max_width = (entry.width, entry.height), manifest.details["max_width"]

@@ -20,7 +20,13 @@ from chronoscene.harness.score.between import (
 )
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
-from chronoscene.images.truth import UNCHANGED, load_changes, load_other, truth_place
+from chronoscene.images.truth import (
+    UNCHANGED,
+    check_distinct,
+    load_changes,
+    load_other,
+    truth_place,
+)
 from chronoscene.scene import Frame, Scene
 
 CHANGE = 0.1
@@ -124,6 +130,7 @@ def _true_changes(
     truth: Path, store: ImageStore, frames: Sequence[Frame], dates: tuple[int, int], max_width: int
 ) -> list[Mask]:
     """Read where views change between the dates; empty if it is not known of all."""
+    check_distinct(truth, (frame.name for frame in frames))
     paths = [truth / truth_place("change", frame.name, _other(frame, dates)) for frame in frames]
     if not all(path.is_file() for path in paths):
         return []

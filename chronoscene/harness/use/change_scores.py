@@ -21,7 +21,7 @@ from chronoscene.harness.use.changes import (
 )
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
-from chronoscene.images.truth import load_changes, truth_place
+from chronoscene.images.truth import check_distinct, load_changes, truth_place
 from chronoscene.io.tables import Table, csv_text
 from chronoscene.metrics.change import change_scores
 from chronoscene.scene import Frame, Scene
@@ -108,6 +108,7 @@ def score_map(run: TrainedRun, scene: Scene, made: ChangeMap) -> dict[str, float
     store = ImageStore(scene, max_width=_width(run))
     scores: list[Array] = []
     masks: list[Pixels] = []
+    check_distinct(scene.root / "gt", (frame.name for frame in scene.select(split="test")))
     for frame in scene.select(split="test"):
         other = sum(made.periods) - frame.period
         path = scene.root / "gt" / truth_place("change", frame.name, other)

@@ -19,7 +19,14 @@ from chronoscene.harness.files.records import ViewScore
 from chronoscene.harness.score.regions import ALL, CHANGED, INVARIANT
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
-from chronoscene.images.truth import UNCHANGED, load_changes, load_depth, load_other, truth_place
+from chronoscene.images.truth import (
+    UNCHANGED,
+    check_distinct,
+    load_changes,
+    load_depth,
+    load_other,
+    truth_place,
+)
 from chronoscene.io.tables import Table
 from chronoscene.metrics.change import change_scores, share_of_other
 from chronoscene.metrics.depth import depth_errors
@@ -56,9 +63,11 @@ def measure_leakage(run: TrainedRun, scene: Scene, truth: Path) -> Iterator[list
         truth: Folder laid out like ``gt/`` of a generated scene; files may be missing.
 
     Raises:
-        ImageError: If a file of the truth is damaged, or a change mask of another size.
+        ImageError: If a file of the truth is damaged or that of two views, or a change mask has
+            another size.
     """
     store = ImageStore(scene, max_width=run.record.max_width)
+    check_distinct(truth, (frame.name for frame in scene.select(split="test")))
     for frame in scene.select(split="test"):
         camera, mask = store.camera(frame), store.load_mask(frame)
         counted = np.ones(camera.size[::-1], bool) if mask is None else mask

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ConfigError, ImageError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import (
     ImageWriter,
@@ -15,6 +15,7 @@ from chronoscene.harness.files.predictions import (
     load_changed,
     read_manifest,
     to_grey,
+    write_manifest,
     write_png,
 )
 from chronoscene.harness.files.records import read_rows, read_run
@@ -156,6 +157,16 @@ def test_views_without_masks_and_folders_of_scenes(runs, truth, tmp_path):
     assert [e.changed_file for e in read_manifest(frozen).images] == [
         e.changed_file for e in entries.values()
     ]
+
+
+def test_views_that_share_a_mask_are_refused(runs, truth):
+    frozen = ground_truth_folder(runs, "ring")
+    manifest = read_manifest(frozen)
+    renamed = [e.model_copy(update={"view": e.view.replace("2.", "1.j")}) for e in manifest.images]
+    write_manifest(frozen, manifest.model_copy(update={"images": tuple(renamed)}))
+    with pytest.raises(ImageError, match="share their files here; rename one of the two images"):
+        freeze_change_masks(runs, truth)
+    assert not list(frozen.rglob("*.changed.png"))
 
 
 def test_what_the_mask_of_a_photo_ignores_is_in_no_region(tmp_path):
