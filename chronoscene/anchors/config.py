@@ -107,8 +107,8 @@ class AnchorConfig(SplattingConfig):
     """Share of the light of any period that may be lost when, once growth is over, the anchors that
     add least to the training views are dropped, and single offsets likewise. 0: none. Not in the
     papers."""
-    growth_levels: NonNegativeInt = 3
-    """Cell sizes that are tried, coarse to fine."""
+    growth_levels: Annotated[int, Field(ge=0, le=1_024)] = 3
+    """Cell sizes that are tried, coarse to fine; each doubles the threshold of the gradients."""
     coarsest_cell: PositiveInt = 16
     """Edge of the coarsest growth cell in voxels."""
     cell_refinement: PositiveInt = 4

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
+from chronoscene.errors import ConfigError
 from chronoscene.kernels.compilation import kernel
 from chronoscene.training import devices
 from chronoscene.training.points import rms_spacing
@@ -27,6 +28,8 @@ from chronoscene.training.points import rms_spacing
 COARSER = 1.02
 """Ratio of the voxel edges that are tried where a cloud would have too many anchors."""
 _POWERS = 4096  # Powers of it that are tried: the last is 1e35
+SMALLEST_CELL = 1e-18
+"""Smallest edge of a voxel, as a share of the largest coordinate: indices have 64 bits."""
 MIN_DISTANCE = 1e-7
 """Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""
 
@@ -77,12 +80,24 @@ def resolve_voxel_size(
             distance to three neighbours, a unit slip that Scaffold-GS and ChronoGS share.
         unit: See `AnchorConfig.voxel_unit`.
         training_from_world: Scale of the similarity from world to training frame.
+
+    Raises:
+        ConfigError: If 64 bits cannot number the cells of the cloud.
     """
     if value == 0:
         return float(np.median(np.square(neighbour_distances(points))))
     if unit == "spacing":
-        return value * median_spacing(points)
-    return value * (training_from_world if unit == "world" else 1.0)
+        size = value * median_spacing(points)
+    else:
+        size = value * (training_from_world if unit == "world" else 1.0)
+    if size < SMALLEST_CELL * np.abs(points).max(initial=0.0):
+        raise ConfigError(
+            "voxel_size",
+            expected=f"at least {SMALLEST_CELL:g} of the largest coordinate of a point",
+            found=f"{value:g}, with voxel_unit={unit}",
+            todo="take larger voxels, or leave out points that are far away",
+        )
+    return size
 
 
 def voxelize(

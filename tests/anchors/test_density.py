@@ -10,6 +10,8 @@ import torch
 
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
+from chronoscene.errors import ConfigError
+from chronoscene.methods import build_config, load_spec
 from chronoscene.training import devices
 
 CONFIG = AnchorConfig(random_growth=False)
@@ -67,6 +69,14 @@ def test_larger_gradients_reach_finer_levels(gradient: float, levels: int) -> No
     new = grown(arrays, statistics_of([gradient], 41))
     # The Gaussian's cells at 0.016, 0.004 and 0.001 are three different ones.
     assert sizes(new.log_scales) == [0.016, 0.004, 0.001][:levels]
+
+
+def test_levels_end_where_their_threshold_is_no_number() -> None:
+    arrays = arrays_of([[0.5, 0.0062, 0.0]], [[1.0]])
+    most = dataclasses.replace(CONFIG, growth_levels=1_024)
+    assert len(grown(arrays, statistics_of([9e-4], 41), most).anchors) == 3
+    with pytest.raises(ConfigError, match="growth_levels: expected a value less than or equal to"):
+        build_config(load_spec("chronogs"), preset="fast", overrides={"growth_levels": 1_025})
 
 
 def test_a_gaussian_needs_more_than_forty_hits() -> None:

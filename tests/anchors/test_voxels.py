@@ -20,6 +20,7 @@ from chronoscene.anchors.density import (
     resolve_voxel_size,
     voxelize,
 )
+from chronoscene.errors import ConfigError
 
 cells = st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=30)
 
@@ -76,6 +77,14 @@ def test_voxel_units(grid: np.ndarray) -> None:
     assert size == pytest.approx({"spacing": 1.0, "training": 0.5, "world": 0.05})
     # Every inner point of the grid has three neighbours at distance 2: the mean square is 4.
     assert resolve_voxel_size(grid, 0.0, "world", training_from_world=0.1) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("unit", ["spacing", "training", "world"])
+def test_voxels_that_64_bits_cannot_number_are_refused(grid: np.ndarray, unit: str) -> None:
+    size = resolve_voxel_size(grid, 1e-16, unit, training_from_world=1.0)
+    assert len(np.unique(pack_cells(cell_indices(torch.from_numpy(grid), size)))) == len(grid)
+    with pytest.raises(ConfigError, match="voxel_size: expected at least 1e-18 of the largest"):
+        resolve_voxel_size(grid, 1e-19, unit, training_from_world=1.0)
 
 
 @pytest.fixture
