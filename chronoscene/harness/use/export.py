@@ -77,7 +77,8 @@ def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = 
         scene: The scene that it was trained on.
         period: Period of the Gaussians.
         viewers: ``plain`` for viewers without the antialiasing filter, ``antialiased`` for those
-            with it; None for plain ones if that loses less than `LIMIT_DB` on training views.
+            with it; None for plain ones if that loses less than `LIMIT_DB` on training views, in
+            between periods on those of the nearest period, whose Gaussians are judged.
 
     Raises:
         ConfigError: If there are no Gaussians, or the run has no filter.
@@ -101,7 +102,12 @@ def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = 
         )
     if viewers == "antialiased" or not run.is_filtered:
         return Prepared(cloud, offset, antialiased=viewers == "antialiased")
-    return _adapted(run, scene, period, Prepared(cloud, offset, antialiased=True), viewers)
+    filtered = Prepared(cloud, offset, antialiased=True)
+    if viewers is None and period != int(period):  # no photo shows it
+        if prepare(run, scene, float(round(period))).antialiased:
+            return filtered
+        viewers = "plain"
+    return _adapted(run, scene, period, filtered, viewers)
 
 
 def make_file(

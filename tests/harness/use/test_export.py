@@ -114,15 +114,18 @@ def test_each_format_shows_what_is_stated(trained, tmp_path, kind, viewers):
     assert lost == pytest.approx(model - measured, abs=0.011)
 
 
+@pytest.mark.parametrize("period", [0, 0.75])
 @pytest.mark.parametrize(("limit", "said"), [(100.0, "without"), (-100.0, "with")])
 def test_plain_viewers_are_the_default_where_little_is_lost(
-    trained, tmp_path, monkeypatch, limit, said
+    trained, tmp_path, monkeypatch, limit, said, period
 ):
+    """In between periods, that is judged at the nearest one."""
     monkeypatch.setattr(exporting, "LIMIT_DB", limit)
-    export(trained["chronogs"], tmp_path / "a.ply", 0)
+    export(trained["chronogs"], tmp_path / "a.ply", period)
     comments = PlyData.read(tmp_path / "a.ply").comments
     assert f"For viewers {said} the antialiasing filter of Mip-Splatting" in comments
-    assert any(line.startswith("PSNR on ") and "with it" in line for line in comments)
+    measured = any(line.startswith("PSNR on ") and "with it" in line for line in comments)
+    assert measured == (period == 0)
 
 
 def test_the_filter_is_for_runs_that_were_trained_with_it(trained, tmp_path):
