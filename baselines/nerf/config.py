@@ -47,7 +47,19 @@ class NerfConfig(FieldConfig):
 
     def without_effect(self) -> dict[str, str]:
         """Return options that do nothing beside the others, and what they need."""
-        return {} if self.transient == "none" else {"opacity_weight": "transient=none"}
+        light = "a code of the light (appearance)"
+        options = {
+            "opacity_weight": ("transient=none", self.transient == "none"),
+            "time_frequencies": ("time=frequencies", self.time == "frequencies"),
+            "time_steps": ("time=steps", self.time == "steps"),
+            "content_weight": ("time=steps", self.time == "steps"),
+            "appearance_size": (light, self.appearance != "none"),
+            "mask_weight": ("transient=mask", self.transient == "mask"),
+            "transient_size": ("transient=density", self.transient == "density"),
+            "transient_weight": ("transient=density", self.transient == "density"),
+            "least_uncertainty": ("transient=density", self.transient == "density"),
+        }
+        return {name: needed for name, (needed, there) in options.items() if not there}
 
 
 @dataclass(frozen=True)
@@ -96,3 +108,11 @@ class HaNerfConfig(NerfConfig):
     """Learning rate of the encoder at the start."""
     code_weight: NonNegativeFloat = 1e-5
     """Weight of the mean square of the codes."""
+
+    def without_effect(self) -> dict[str, str]:
+        """Return options that do nothing beside the others, and what they need."""
+        idle = super().without_effect()
+        if self.appearance == "none":
+            names = "channels", "photo_size", "encoder_rate", "code_weight"
+            idle |= dict.fromkeys(names, "appearance=encoder")
+        return idle

@@ -69,6 +69,15 @@ def test_flags_go_together(name: str, values: tuple[str, ...], tmp_path: Path) -
         ("nerf-w", {"opacity_weight": 0.01}, "nerf-w --set opacity_weight: .* transient=none"),
         ("neusc", {"opacity_weight": 0.01}, "neusc --set opacity_weight: .* transient=none"),
         ("nerf", {"opacity_weight": 0.01, "transient": "mask"}, "nerf --set opacity_weight: "),
+        ("nerf-w-t", {"time_steps": 8}, "nerf-w-t --set time_steps: expected time=steps, without"),
+        ("neusc", {"time_frequencies": 2}, "neusc --set time_frequencies: .* time=frequencies"),
+        ("neusc", {"content_weight": 0.5, "time": "none"}, "content_weight: expected time=steps"),
+        ("neusc", {"appearance_size": 8, "appearance": "none"}, "expected a code of the light"),
+        ("nerf-w", {"mask_weight": 0.1}, "mask_weight: expected transient=mask"),
+        ("neusc", {"transient_size": 8}, "transient_size: expected transient=density"),
+        ("neusc", {"transient_weight": 8}, "transient_weight: expected transient=density"),
+        ("nerf", {"least_uncertainty": 0.2}, "least_uncertainty: expected transient=density"),
+        ("ha-nerf", {"channels": 8, "appearance": "none"}, "channels: expected appearance=encoder"),
         ("nerf", {"time": "frequencies"}, "nerf --set time: expected 'none', found 'frequ"),
         ("nerf-w", {"time": "frequencies"}, "nerf-w --set time: expected 'none', found 'frequ"),
     ],
@@ -76,8 +85,14 @@ def test_flags_go_together(name: str, values: tuple[str, ...], tmp_path: Path) -
 def test_options_without_effect_are_refused(name: str, given: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build_config(load_spec(name), preset="fast", overrides=given)
-    spec = load_spec("nerf")
-    assert build_config(spec, preset="fast", overrides={"opacity_weight": 0.01}) is not None
+    for name, options in (
+        ("nerf", {"opacity_weight": 0.01}),
+        ("nerf-t", {"time_frequencies": 2}),
+        ("neusc", {"time_steps": 8, "content_weight": 0.5, "mask_weight": 0.1}),
+        ("nerf-w", {"transient_size": 8, "transient_weight": 0.1, "least_uncertainty": 0.2}),
+        ("ha-nerf", {"appearance_size": 8, "channels": 8, "photo_size": 16, "code_weight": 0.1}),
+    ):
+        assert build_config(load_spec(name), preset="fast", overrides=options) is not None
 
 
 def test_steps_are_hard_and_have_a_slope() -> None:
