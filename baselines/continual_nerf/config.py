@@ -39,6 +39,11 @@ class ContinualConfig(ReplayConfig):
     """Error of replayed rays: as of new ones; or sqrt(d^2 + 1e-6) with a weight that rises from 0
     to 1 over the period (MEIL-NeRF)."""
 
+    def without_effect(self) -> dict[str, str]:
+        """Return options that do nothing beside the others, and what they need."""
+        replayed = {} if self.replay != "none" else {"replay_loss": "a replay"}
+        return super().without_effect() | replayed
+
 
 @dataclass(frozen=True)
 class AdaptorConfig(ReplayConfig):
@@ -55,6 +60,11 @@ class AdaptorConfig(ReplayConfig):
     """Logarithm of the largest number of rows of a level in the hash grid of an adaptor."""
     change_weight: NonNegativeFloat = 0.01
     """Weight of the mean share of change that rays see."""
+
+    def without_effect(self) -> dict[str, str]:
+        """Return options that do nothing beside the others; adaptors always have grids."""
+        idle = super().without_effect()
+        return {name: idle[name] for name in idle if name in ("frequencies", "log2_rows")}
 
     @property
     def expert_layout(self) -> GridLayout:

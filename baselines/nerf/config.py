@@ -59,7 +59,8 @@ class NerfConfig(FieldConfig):
             "transient_weight": ("transient=density", self.transient == "density"),
             "least_uncertainty": ("transient=density", self.transient == "density"),
         }
-        return {name: needed for name, (needed, there) in options.items() if not there}
+        idle = {name: needed for name, (needed, there) in options.items() if not there}
+        return super().without_effect() | idle
 
 
 @dataclass(frozen=True)

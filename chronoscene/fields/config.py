@@ -10,6 +10,8 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from chronoscene.fields.grid import GridLayout
 from chronoscene.methods import check_options
 
+GRID_OPTIONS = ("levels", "log2_rows", "base", "finest", "learning_rate")
+"""Options of hash grids, which a field without one does not read."""
 Cells = Annotated[int, Field(ge=1, le=1 << 20)]
 """Cells along an edge of a level; 64 bits hold the number of all its grid points."""
 
@@ -61,6 +63,12 @@ class FieldConfig:
 
     def __post_init__(self) -> None:
         check_options(self)
+
+    def without_effect(self) -> dict[str, str]:
+        """Return options that do nothing beside the others, and what they need."""
+        if self.encoding == "grid":
+            return {"frequencies": "encoding=frequencies"}
+        return dict.fromkeys(GRID_OPTIONS, "encoding=grid")
 
     @property
     def layout(self) -> GridLayout:

@@ -121,6 +121,21 @@ def test_a_new_network_for_a_period_is_refused() -> None:
         begun(start="fresh")
 
 
+def test_options_without_effect_are_refused() -> None:
+    """Adaptors have grids, also where the field has none."""
+    spec, plain = load_spec("cl-nerf"), {"encoding": "frequencies"}
+    for name, options, expected in (
+        ("cl-nerf", plain | {"log2_rows": 12}, "log2_rows: expected encoding=grid"),
+        ("clnerf", {"replay": "none", "replay_loss": "charbonnier"}, "expected a replay, without"),
+    ):
+        with pytest.raises(ConfigError, match=expected):
+            build_config(load_spec(name), preset="fast", overrides=options)
+    config = build_config(
+        spec, preset="fast", overrides=plain | {"levels": 4, "learning_rate": 0.1}
+    )
+    assert config.levels == 4  # type: ignore[attr-defined]
+
+
 def test_a_table_that_no_memory_holds_is_refused() -> None:
     with pytest.raises(ConfigError, match="log2_rows: expected a value less than or equal to 24"):
         begun(log2_rows=40)

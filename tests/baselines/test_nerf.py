@@ -78,6 +78,8 @@ def test_flags_go_together(name: str, values: tuple[str, ...], tmp_path: Path) -
         ("neusc", {"transient_weight": 8}, "transient_weight: expected transient=density"),
         ("nerf", {"least_uncertainty": 0.2}, "least_uncertainty: expected transient=density"),
         ("ha-nerf", {"channels": 8, "appearance": "none"}, "channels: expected appearance=encoder"),
+        ("nerf", {"frequencies": 4}, "frequencies: expected encoding=frequencies, without which"),
+        ("nerf", {"encoding": "frequencies", "levels": 4}, "levels: expected encoding=grid"),
         ("nerf", {"time": "frequencies"}, "nerf --set time: expected 'none', found 'frequ"),
         ("nerf-w", {"time": "frequencies"}, "nerf-w --set time: expected 'none', found 'frequ"),
     ],
@@ -87,6 +89,7 @@ def test_options_without_effect_are_refused(name: str, given: dict[str, Any], me
         build_config(load_spec(name), preset="fast", overrides=given)
     for name, options in (
         ("nerf", {"opacity_weight": 0.01}),
+        ("nerf", {"encoding": "frequencies", "frequencies": 4}),
         ("nerf-t", {"time_frequencies": 2}),
         ("neusc", {"time_steps": 8, "content_weight": 0.5, "mask_weight": 0.1}),
         ("nerf-w", {"transient_size": 8, "transient_weight": 0.1, "least_uncertainty": 0.2}),
