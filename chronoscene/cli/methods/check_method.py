@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from importlib.util import find_spec
 from keyword import iskeyword
 from pathlib import Path
@@ -58,7 +59,7 @@ def new(name: str, out: Path | None) -> None:
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
         raise ConfigError(
             "NAME",
-            expected="small letters and digits, in words joined by hyphens",
+            expected="a small letter, then small letters and digits, in words joined by hyphens",
             found=repr(name),
             todo="choose a name like my-method",
         )
@@ -78,7 +79,7 @@ def new(name: str, out: Path | None) -> None:
             target.write_text(renamed(source.read_text(encoding="utf-8"), name), encoding="utf-8")
     click.echo(
         f"wrote {out}; next:\n"
-        f"  pip install --editable {out}\n"
+        f"  pip install --editable {shlex.quote(str(out))}\n"
         f"  chronoscene check-method {name}\n"
         f"  chronoscene bench SCENE --method {name} --preset fast"
     )

@@ -38,9 +38,14 @@ def test_a_new_method_is_the_example_with_another_name(tmp_path):
     assert "inted" not in "".join(new.values())
 
 
+def test_the_command_to_install_names_a_folder_with_blanks_as_a_shell_takes_it(tmp_path):
+    result = run("new-method", "mine", "--out", tmp_path / "a b")
+    assert f"pip install --editable '{tmp_path}/a b'\n" in result.stdout
+
+
 def test_wrong_names_and_places_are_refused(tmp_path):
     for name in ("My-Method", "3dgs", "a_b", "a-"):
-        with pytest.raises(ConfigError, match="small letters and digits"):
+        with pytest.raises(ConfigError, match="a small letter, then small letters and digits"):
             run("new-method", name, "--out", tmp_path / "new")
     for name in ("class", "torch", "chronogs"):
         with pytest.raises(ConfigError, match=f"'{name}', whose package would stand in its place"):
