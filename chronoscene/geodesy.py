@@ -139,10 +139,11 @@ def read_reference_system(
             found = ", which PROJ does not convert to WGS 84 exactly"
             raise wrong(found, "convert to a system on WGS 84") from cause
     if not group.best_available:
-        grids = (g.short_name for op in group.unavailable_operations[:1] for g in op.grids)
+        grids = [g.short_name for op in group.unavailable_operations[:1] for g in op.grids]
+        install = "; ".join(f"pyproj sync --file {grid}" for grid in grids)
         raise wrong(
             f", which PROJ converts exactly only with the grid {', '.join(grids)}",
-            "install it (pyproj sync), or convert to a system on WGS 84",
+            f"install it ({install}), or convert to a system on WGS 84",
         )
     unit = float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected else 1.0
     axes = tuple(str(axis.direction) for axis in crs.axis_info[:2])
