@@ -152,6 +152,8 @@ class Inspection:
     """On the alignment of the periods with each other."""
     position: Position
     """On position and scale in the world."""
+    ties: tuple[str, ...] = ()
+    """Remarks on tie points and control: what was done with them, and what was left out."""
 
     @property
     def failed(self) -> bool:
@@ -169,6 +171,9 @@ class Inspection:
         if position.scale_error is not None:
             lines.append(f"  scale: known to {position.scale_error:.2%} by GPS")
         lines += [f"  {c.what}: {c.text}" for c in position.metadata]
+        lines += [f"  tie points: {remark}" for remark in self.ties[:5]]
+        if len(self.ties) > 5:
+            lines.append(f"  ... and {len(self.ties) - 5} more; see {LOG}")
         lines += [f"  to do: {todo}" for todo in position.todo[:3]]
         return "\n".join(lines) + "\n"
 
@@ -203,4 +208,4 @@ def inspect_registration(
         title = title or f"Registration of {folder.resolve().name}"
         text = render_report(model, certificate, verdict, position, ties=ties, title=title)
         write_text_atomic(folder / PAGE, text)
-    return Inspection(certificate, verdict, position)
+    return Inspection(certificate, verdict, position, () if ties is None else ties.remarks)

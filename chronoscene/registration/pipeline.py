@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.colmap.model import copy_poses
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ConfigError, SceneError
 from chronoscene.geodesy import ReferenceSystem, read_projected
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import write_text_atomic
@@ -59,7 +59,8 @@ def run(
     Raises:
         RegistrationError: If there is no model, or none of the photos can be placed; what was
             computed is kept in the work folder.
-        SceneError: If ``out`` is in use, tie points do not suffice, or ``into`` has distortion.
+        SceneError: If ``out`` is in use, tie points do not suffice or have no clicks, or ``into``
+            has distortion.
         ConfigError: If tie points are given together with ``into``, or the reference system is
             unsuitable.
     """
@@ -79,6 +80,13 @@ def run(
     points = None
     if options.tie_points is not None:
         points = read_tie_points(options.tie_points, scale=options.tie_scale, crs=crs)
+        if not any(point.clicks for point in points.points):
+            raise SceneError(
+                options.tie_points,
+                expected="points that are clicked in photos",
+                found="coordinates without a click",
+                todo="mark the points: chronoscene mark CAPTURES PAGE --tie-points FILE",
+            )
         if crs is None and points.crs is not None and points.crs.is_projected:
             crs = read_projected(str(options.tie_points), points.crs.text)
     with work_folder(work) as lock:

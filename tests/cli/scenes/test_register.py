@@ -191,6 +191,16 @@ def test_axes_of_control_are_checked_before_any_work(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["gcp.csv", "in"]
 
 
+def test_coordinates_without_a_click_are_refused_before_any_work(tmp_path: Path) -> None:
+    file = tmp_path / "gcp.csv"
+    file.write_text("point,image,x,y,X,Y,Z\np,,,,1,2,3\nq,,,,4,5,6\n")
+    done = call(photos(tmp_path / "in/a", 3).parent, tmp_path / "out", "--tie-points", file)
+    assert isinstance(done.exception, SceneError), done.output
+    assert done.exception.place == str(file) and "without a click" in done.exception.found
+    assert "chronoscene mark" in done.exception.todo
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["gcp.csv", "in"]
+
+
 @pytest.mark.parametrize(
     ("option", "value", "given", "condition"),
     [

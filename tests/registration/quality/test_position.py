@@ -276,6 +276,17 @@ def inspected(
     return inspect_registration(ties.model, folder, page=True, ties=ties, tie_points=points)
 
 
+def test_control_and_clicks_that_take_no_part_are_named(tmp_path: Path, made: Generated) -> None:
+    file = survey(tmp_path / "s.csv", made, checks=(1, 2, 3, 4, 6, 7))
+    file.write_text(file.read_text() + "g0,2016/typo.jpg,1,2,,,,\n")
+    points = read_tie_points(file)
+    ties = align_with_tie_points(made.model, points, output=UTM)
+    lines = inspect_registration(ties.model, tmp_path, ties=ties).summary.splitlines()
+    assert "  tie points: 2016/typo.jpg: has clicks, but is not registered" in lines
+    few = "2 control points can be placed; three that are not collinear are needed"
+    assert f"  tie points: {few}" in lines
+
+
 def test_both_verdicts_are_in_terminal_json_and_page(tmp_path: Path, made: Generated) -> None:
     off = dict.fromkeys((0, 2, 4, 5, 6), (0.0, 0.0, 3.0))
     found = inspected(tmp_path, made, off=off)
