@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import EXISTING_FOLDER, LPIPS_WEIGHTS, RUNS, refuse_options, split_list
-from chronoscene.cli.output import FORMAT, OUT_FILE, emit, say, terminal_width
+from chronoscene.cli.output import FORMAT, OUT_FILE, check_place, emit, say, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RESULTS_FILE, ROWS_FILE
@@ -53,6 +53,7 @@ def score(
     Change masks are frozen with the ground truth, so that later runs in RUNS are scored with them,
     too.
     """
+    check_place("RUNS", runs)
     with progress_bar("load the metrics") as bar:
         wanted = parse_metrics(metrics)
         if wanted and not any(name.startswith("lpips_") for name in wanted):

@@ -1,8 +1,10 @@
 """``chronoscene table`` and ``score``: formats, files, choices, what changed."""
 
 import csv
+import errno
 import io
 import json
+import os
 from pathlib import Path
 from shutil import copytree
 
@@ -312,6 +314,15 @@ def test_a_run_that_cannot_be_scored_gives_status_1(score, tmp_path):
     assert result.exit_code == 1
     assert "s/m/seed0: error: an image was edited" in result.output
     assert "s/m/seed1: unchanged" in result.output
+
+
+def test_runs_that_cannot_be_written_to_are_refused_before_scoring(score, monkeypatch, tmp_path):
+    def read_only(**options):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("chronoscene.cli.output.TemporaryFile", read_only)
+    with pytest.raises(ConfigError, match=f"RUNS {tmp_path}: expected a place that can be written"):
+        score(Rescored(tmp_path / "s/m/seed0", [], []))
 
 
 def test_a_folder_without_runs(tmp_path):
