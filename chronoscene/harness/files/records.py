@@ -28,6 +28,7 @@ from chronoscene.methods import PeriodSharing
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.json"
 FAILURE_FILE = "failed.json"
+ERROR_LOG = "error.log"
 ROWS_FILE = "rows.csv"
 CURVE_FILE = "curve.csv"
 RESULTS_FILE = "results.json"

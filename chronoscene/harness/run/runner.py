@@ -100,6 +100,8 @@ def run_plan(
         if (failure := execute(job)) is not None:
             failures.append(failure)
             log(f"failed: {job.label}: {failure.reason}")
+            if (trace := job.folder / records.ERROR_LOG).is_file():
+                log(f"{job.label}: {trace}")
 
     try:
         with stoppable():

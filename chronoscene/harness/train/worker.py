@@ -386,6 +386,6 @@ def execute(document: dict[str, Any], report: Report) -> None:
     except ChronoSceneError as error:
         records.write_failure(staging, job.failure(str(error)))
     except Exception as error:  # a fault in a method must not end the other runs
-        write_text_atomic(staging / "error.log", traceback.format_exc())
-        reason = f"{type(error).__name__}: {error} (see error.log)"
+        write_text_atomic(staging / records.ERROR_LOG, traceback.format_exc())
+        reason = f"{type(error).__name__}: {error} (see {records.ERROR_LOG})"
         records.write_failure(staging, job.failure(reason))

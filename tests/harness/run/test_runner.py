@@ -131,7 +131,9 @@ def test_failures_stop_nobody_else(finished_bench):
     kept = runs / "ring/not-finite-joint-balanced/seed0/checkpoint/model.json"
     assert np.isfinite(json.loads(kept.read_text())["colors"]).all()
     assert reasons["killed"] == "the process ended with signal SIGKILL (out of memory?)"
-    assert "the toy is broken" in (runs / "ring/raises-joint-balanced/seed0/error.log").read_text()
+    trace = runs / "ring/raises-joint-balanced/seed0/error.log"
+    assert "the toy is broken" in trace.read_text()
+    assert any(line.endswith(f"seed 0: {trace}") for line in said)
     assert any("blind takes no period" in line for line in said)
     assert len(records.read_failures(runs)) == 3
 
