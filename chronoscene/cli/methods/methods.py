@@ -130,7 +130,8 @@ def describe_cost(spec: MethodSpec, runs: Path) -> str:
     if not records:
         return (
             f"No run of it in {runs}. Time and memory depend on scene, preset and machine:\n"
-            f"    chronoscene bench SCENE --method {spec.name} --preset balanced --out {runs}\n"
+            f"    chronoscene bench SCENE --method {spec.name} --preset balanced --out "
+            f"{shlex.quote(str(runs))}\n"
             "measures them, and this command shows them then."
         )
     devices = dict.fromkeys(run.device for run in records)

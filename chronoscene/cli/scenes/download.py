@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 
 import click
 
@@ -75,7 +76,7 @@ def _after(dataset: Dataset, folder: Path) -> str:
     return (
         f"licence: {dataset.licence} ({dataset.page})\n"
         f"cite: {dataset.citation}\n"
-        f"next: chronoscene validate {folder}\n"
+        f"next: chronoscene validate {quote(str(folder))}\n"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from shlex import quote
 
 import numpy as np
 
@@ -127,15 +128,15 @@ def check_scene(scene: Scene) -> None:
                 expected=f"a camera without distortion ({', '.join(PINHOLE_MODELS)}, or "
                 "another model whose distortion parameters are all zero)",
                 found=frame.camera.model,
-                todo=f"{way_to_pinhole(frame.camera, f'{scene.root} OUT')} first",
+                todo=f"{way_to_pinhole(frame.camera, f'{quote(str(scene.root))} OUT')} first",
             )
     if not scene.select(split="train"):
         raise SceneError(
             scene.root,
             expected="at least one train image",
             found=f"none ({scene.split_rule})",
-            todo=f"hold out whole periods (chronoscene split {scene.root} --scene-out NEW "
-            "--strategy periods --period ID), and use NEW",
+            todo=f"hold out whole periods (chronoscene split {quote(str(scene.root))} --scene-out "
+            "NEW --strategy periods --period ID), and use NEW",
         )
 
 

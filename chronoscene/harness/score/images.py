@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from chronoscene.errors import ConfigError, ImageError, SceneError
@@ -228,7 +229,8 @@ def _test_views(scene: Scene) -> tuple[Frame, ...]:
             scene.root,
             expected="test views to score",
             found=f"none ({scene.split_rule})",
-            todo=f"choose some (chronoscene split {scene.root} --scene-out NEW), and use NEW",
+            todo=f"choose some (chronoscene split {quote(str(scene.root))} --scene-out NEW), "
+            "and use NEW",
         )
     return tests
 

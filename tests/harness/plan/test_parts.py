@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -277,8 +278,9 @@ def test_distorted_cameras_are_refused(make_scene):
         scene.frames[0].camera, model="OPENCV", params=(20.0, 20.0, 12.0, 8.0) + (0.1,) * 4
     )
     bent = scene.with_frames([replace(scene.frames[0], camera=camera), *scene.frames[1:]])
+    bent = replace(bent, root=Path("a b"))
     with pytest.raises(
-        SceneError, match=r"a/0\.png: expected .* found OPENCV; run chronoscene undistort"
+        SceneError, match=r"a/0\.png: expected .* found OPENCV; run chronoscene undistort 'a b' OUT"
     ):
         parts_of(bent, "joint")
 
