@@ -39,7 +39,7 @@ SECTIONS = {
     },
     "Benchmarks": {
         "bench": ("runs.bench:command", "Train, render and score methods on scenes."),
-        "study": ("runs.study:command", "Run variants of a method on scenes, for one table."),
+        "study": ("runs.study:command", "Compare variants of a method in one table."),
         "tune": ("runs.tune:command", "Search for options by scores on validation views."),
         "score": ("report.results:score", "Score finished runs again and print what changed."),
         "score-images": (
@@ -73,7 +73,10 @@ SECTIONS = {
             "runs.changes:command",
             "Map what changes between the periods of a finished run.",
         ),
-        "survey": ("runs.survey:command", "Make maps and differences of elevations."),
+        "survey": (
+            "runs.survey:command",
+            "Make maps, point clouds, elevation differences and volumes.",
+        ),
         "export": ("runs.export:command", "Export periods of a finished run as Gaussians."),
         "compress": ("runs.compress:command", "Compress the model of a finished run."),
     },

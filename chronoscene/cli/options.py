@@ -138,7 +138,7 @@ PLUGIN = click.option(
     "--plugin",
     metavar="module:SPEC",
     callback=_plugins,
-    help="Method that is not installed whose runs may be opened, or several, separated by commas. "
+    help="Also open runs of this method, which is not installed; several are separated by commas. "
     "Its code is executed.",
 )
 

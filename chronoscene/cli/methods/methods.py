@@ -31,7 +31,7 @@ from chronoscene.methods.options import Option
     "--runs",
     type=FOLDER,
     default=Path("runs"),
-    help="Folder of finished runs, which say what the method NAME costs.",
+    help="Folder of finished runs, from which the costs of the method NAME are taken.",
 )
 @click.option("--all", "everything", is_flag=True, help="Show all options of the method NAME.")
 def command(name: str | None, runs: Path, everything: bool) -> None:

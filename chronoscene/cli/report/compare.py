@@ -47,7 +47,7 @@ from chronoscene.metrics.registry import metric_info
     "style",
     type=click.Choice(["table", "csv"]),
     default="table",
-    help="Format of the table; csv has every view, not the worst alone.",
+    help="Format of the table; csv has every view, table the worst only.",
 )
 @click.option("--out", type=FILE, help="Write the table to this file instead of the terminal.")
 @click.option(

@@ -39,9 +39,8 @@ SOME_FAILED = 1  # Exit status when a run could not be scored
 @click.option(
     "--truth",
     type=EXISTING_FOLDER,
-    help="Also score what changes between periods, and what does not, apart: by the change masks "
-    "in this folder, which is laid out like the gt/ of a generated scene; or in SCENE/gt/ of a "
-    "folder of scenes.",
+    help="Also score changed and invariant regions, by the change masks in this folder. It is laid "
+    "out like the gt/ of a generated scene, or contains scenes with a gt/.",
 )
 @LPIPS_WEIGHTS
 def score(
@@ -50,8 +49,8 @@ def score(
     """Score finished runs again and print what changed.
 
     Only the stored predictions and the frozen ground truth are read; their hashes are checked.
-    Change masks are frozen with the ground truth, so that later runs in RUNS are scored with them,
-    too.
+    Change masks are frozen with the ground truth, so that later runs in RUNS are also scored with
+    them.
     """
     check_place("RUNS", runs)
     with progress_bar("load the metrics") as bar:
@@ -113,21 +112,21 @@ def print_runs(out: Path, new: Collection[Path] | None = None) -> None:
     "--published",
     "with_published",
     is_flag=True,
-    help="Show what the paper of ChronoGS printed for the scenes beside the runs.",
+    help="Also show what the paper of ChronoGS printed for scenes of these names.",
 )
 @click.option(
-    "--periods", is_flag=True, help=f"Show every period where there are more than {MAX_PERIODS}."
+    "--periods", is_flag=True, help=f"Show every period, even if there are more than {MAX_PERIODS}."
 )
 @click.option(
     "--columns",
-    help="Columns to show and no others, by their heads, as HEAD[,HEAD...]; units may be left out.",
+    help="Show only these columns, by their headings, as HEAD[,HEAD...]; units may be left out.",
 )
 @click.option(
     "--rename",
     "renames",
     metavar="OLD=NEW",
     multiple=True,
-    help="Write NEW in place of OLD, which is part of the name of a method. May be repeated.",
+    help="Write NEW in place of OLD in the names of methods. May be repeated.",
 )
 @OUT_FILE
 def table(

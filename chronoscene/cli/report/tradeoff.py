@@ -77,7 +77,7 @@ def command(
     Draw and print Pareto fronts of PSNR, SSIM and LPIPS against training time, rendering rate, size
     and memory; then print the PSNR of the probe views after given training times, and the times at
     which they reach a given PSNR. CSV has all points. With --budget, --max-bytes or --target-psnr,
-    only the configuration to use is printed. docs/guides/tables-and-figures.md, "Trade-off".
+    only the configuration to use is printed. docs/guides/tables-and-figures.md explains both.
     """
     records, failures = read_runs(folders)
     records = as_configurations(records)

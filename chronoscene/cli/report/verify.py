@@ -28,11 +28,11 @@ NOT_VERIFIED = 1  # Exit status when something differs or is absent
 def command(folders: tuple[Path, ...], entries: Path | None, lpips_weights: Path | None) -> None:
     """Compute scores again and compare them with stored ones.
 
-    RUNS are folders of runs, or of single ones. The scores follow from the predictions and the
-    frozen ground truth; run.json, results.json, both rows.csv and, with --entries, entries of the
-    leaderboard have to agree with them within 1e-6, relative where a value is above 1. The hashes
-    of images, model and configuration and the bytes of the model are compared as well. Nothing is
-    written. The exit status is 0 if everything agrees.
+    RUNS are folders of single runs or of many. Scores are computed from the stored predictions and
+    the frozen ground truth, and compared with run.json, results.json, both rows.csv and, with
+    --entries, entries of the leaderboard. Values agree if they differ by at most 1e-6 (relative for
+    values above 1). The hashes of images, model and configuration and the bytes of the model are
+    compared as well. Nothing is written. Exit status: 0 if everything agrees, else 1.
     """
     with progress_bar("load the metrics") as bar:
         found = [

@@ -31,11 +31,11 @@ def command(
     CAPTURES is what register takes: for example, a folder with a subfolder of photos for each
     period. The photos are registered, the scene is checked, ChronoGS is trained on it, and the
     model is made into a page to walk through, exported, and surveyed. OUT/index.html links
-    everything. The same command continues a run that was stopped; where photos or options have
-    changed, it makes anew what follows from them.
+    everything. The same command continues a run that was stopped; if photos or options have
+    changed, it repeats the steps that depend on them.
 
-    The training is not begun if the alignment of the periods fails. Exit status: 0 if all steps are
-    done or were skipped for a reason, 2 if one fails.
+    Nothing is trained if the alignment of the periods fails. Exit status: 0 if all steps are done
+    or were skipped for a reason, 2 if one fails.
     """
     check_place("OUT", out)
     record, changes = start(captures, table, out, options)

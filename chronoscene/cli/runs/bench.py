@@ -52,7 +52,7 @@ MEMORY = click.option(
     "--photo-memory",
     type=FiniteRange(min=0),
     default=PHOTO_MEMORY / 1e9,
-    help="Memory for training photos in GB, the decoding of them included.",
+    help="Memory for training photos in GB, including their decoding.",
 )
 
 
@@ -90,7 +90,7 @@ MEMORY = click.option(
 @click.option(
     "--checkpoint-every",
     default="5m",
-    help="Time between checkpoints, from which a run that was stopped goes on.",
+    help="Time between checkpoints, from which a run that was stopped continues.",
 )
 @click.option(
     "--keep-training",

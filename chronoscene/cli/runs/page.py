@@ -16,7 +16,9 @@ from chronoscene.harness.use.trained_run import open_run
 @click.command("page")
 @click.argument("folders", metavar="RUN...", nargs=-1, required=True, type=PATH)
 @click.option("--out", type=FOLDER, required=True, help="New folder for the page.")
-@click.option("--period", help="Period (number or label) or range FROM:TO in it.  [default: all]")
+@click.option(
+    "--period", help="Period (number or label), or range FROM:TO, to show.  [default: all]"
+)
 @click.option(
     "--max-megabytes",
     type=FiniteRange(min=0, min_open=True),

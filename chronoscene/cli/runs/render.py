@@ -65,13 +65,13 @@ def parse_size(
     "--cameras",
     default="test",
     help=f"{', '.join(VIEWS)}, the folder of a COLMAP model, or a JSON camera path of nerfstudio. "
-    "Poses are in the world of the scene; a dataparser_transforms.json beside a camera path is "
-    "undone.",
+    "Poses are in the world of the scene; those of a camera path beside dataparser_transforms.json "
+    "are in the frame of that model.",
 )
 @click.option(
     "--period",
     help="Period (number, label or fraction), or a range FROM:TO, through which an orbit or path "
-    "moves; any other camera shows all of it.  [default: the period of each camera]",
+    "passes once; any other camera stands still meanwhile.  [default: the period of each camera]",
 )
 @click.option("--appearance-period", help="Show the geometry in the colours of this period.")
 @click.option(

@@ -34,12 +34,12 @@ ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 @LPIPS_WEIGHTS
 @RUNS_OUT
 def command(name: str, seeds: int, out: Path, **options: Any) -> None:
-    """Run variants of a method on scenes, for one table.
+    """Compare variants of a method in one table.
 
-    NAME is a study that comes with a method, such as components of ChronoGS, or FILE.toml one of
-    your own; docs/guides/studies.md describes both. The runs are those of bench; finished ones are
-    kept; --set is for the rows that do not set the option themselves. The table says what was
-    published beside what was measured, and is written to --out as Markdown, CSV and JSON, too.
+    NAME is a study that comes with a method, such as components of ChronoGS; FILE.toml is one of
+    your own. docs/guides/studies.md describes both. The runs are those of bench, and finished ones
+    are kept. --set applies to the rows that do not set the option themselves. The table has
+    measured and published values. It is also written to --out as Markdown, CSV and JSON.
     """
     file = find_study(name)
     study = read_study(file)

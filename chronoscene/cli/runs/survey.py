@@ -58,12 +58,12 @@ def command(
     device: str,
     plugin: tuple[str, ...],
 ) -> None:
-    """Make maps and differences of elevations.
+    """Make maps, point clouds, elevation differences and volumes.
 
     RUN is the folder of a finished run, such as runs/plaza/chronogs-joint-balanced/seed0. For each
     period, OUT gets an orthophoto and a surface model (GeoTIFF) and a point cloud (LAZ); for each
     pair of periods the difference of elevations with its level of detection, volumes of cut and
-    fill, and distances by M3C2 (LAZ). Of a SCENE without a model, there are point clouds and
+    fill, and distances by M3C2 (LAZ). For a SCENE without a model, OUT gets point clouds and
     distances of its sparse points. docs/guides/survey.md explains the numbers.
     """
     check_packages()

@@ -40,10 +40,10 @@ def command(
 ) -> None:
     """Search for options by scores on validation views.
 
-    Each trial trains METHOD on each scene with other options, as bench --validation does it; the
-    first has those of the preset. The mean PSNR decides. --out gets preset.toml with the best
-    options, which bench takes as --preset, and trials.csv. The same command goes on after an
-    interruption, or with more --trials. docs/guides/tuning.md describes what is searched.
+    Each trial trains METHOD on each scene with other options, as bench --validation does; the first
+    trial has those of the preset. The options with the highest mean PSNR are written to preset.toml
+    in --out, which bench takes as --preset; trials.csv has all trials. The same command continues
+    after an interruption, also with more --trials. docs/guides/tuning.md describes the search.
     """
     look_here_for([method])
     settings = settings_from(

@@ -26,7 +26,7 @@ from chronoscene.kernels.runtime import keep_freed_memory
     "--port", type=click.IntRange(1, 65535), help=f"Port.  [default: the first free from {PORT} on]"
 )
 @click.option(
-    "--host", default="127.0.0.1", help="Address; 0.0.0.0 lets in all who reach this machine."
+    "--host", default="127.0.0.1", help="Address; 0.0.0.0 lets in all who can reach this machine."
 )
 @SCENE
 @reading_options("the scene, if no run is viewed")

@@ -58,9 +58,9 @@ def command(
     """Drop images, periods or points; rename periods or images.
 
     OUT is a new folder in the ChronoScene format; SCENE is not changed. An image stays if all
-    options allow it. Periods are numbered anew where one goes; the split of the remaining images,
-    their poses, masks, and the labels and dates of the periods stay. Points that lose observations
-    with dropped images go if fewer than two are left.
+    options allow it. If a period is left out, the others are renumbered. The split of the remaining
+    images, their poses and masks, and the labels and dates of the periods stay. A point that loses
+    observations with dropped images is removed if fewer than two are left.
     """
     edits = Edits(
         keep=keep,

@@ -76,8 +76,8 @@ FAILED = 1  # Exit status if a verdict is fail
 @click.option(
     "--cameras",
     type=EXISTING_FILE,
-    help="Known calibrations: lines of a pattern of photo names, then model, width, height and "
-    "parameters as in COLMAP's cameras.txt. --route resection keeps them, others refine them.",
+    help="Known calibrations. Each line has a pattern of photo names, then model, width, height "
+    "and parameters as in COLMAP's cameras.txt. --route resection keeps them, others refine them.",
 )
 @click.option(
     "--camera-model",
@@ -90,8 +90,9 @@ FAILED = 1  # Exit status if a verdict is fail
     "--calibration",
     type=click.Choice(CALIBRATIONS),
     default=DEFAULTS.calibration,
-    help="Whether a camera is calibrated anew for each period; auto: for periods more than a day "
-    f"apart that have at least {MIN_PHOTOS} of its photos.",
+    help="per-period: a calibration of each camera for each period. shared: one for all periods. "
+    f"auto: one for each period that has at least {MIN_PHOTOS} of its photos and is more than a "
+    "day from the others.",
 )
 @click.option(
     "--threads",
@@ -112,8 +113,8 @@ FAILED = 1  # Exit status if a verdict is fail
     "--tie-points",
     type=EXISTING_FILE,
     help="CSV of point, image, x, y and optional world coordinates X, Y, Z and role (control or "
-    "check), or ODM's gcp_list.txt: points that check the alignment, replace one that failed, and "
-    "place the model in the world.",
+    "check), or ODM's gcp_list.txt. The points check the alignment, replace an alignment that "
+    "failed, and place the model in the world.",
 )
 @click.option(
     "--crs",

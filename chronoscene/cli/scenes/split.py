@@ -48,8 +48,8 @@ from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, Split
 @click.option(
     "--seed",
     type=int,
-    help="For stratified: draw a random image of each run instead of the first. For blocked: "
-    "choose other blocks.",
+    help="For stratified: draw a random image of every N neighbours, not the first. For "
+    "blocked: choose other blocks.",
 )
 @click.option("--blocks", type=int, metavar="N", help="For blocked: total number of blocks.")
 @click.option(

@@ -22,9 +22,11 @@ from chronoscene.synth.settings import KINDS
 @click.option("--preset", "name", default="demo",
               help=f"Sizes: {', '.join(PRESETS)}.")  # fmt: skip
 @click.option("--periods", type=int, help="Number of dates of capture.")
-@click.option("--kind", help=f"Cameras: {', '.join(KINDS[:-1])}, or {KINDS[-1]}: close together.")
+@click.option("--kind", help=f"Cameras: {', '.join(KINDS[:-1])}, or {KINDS[-1]} (close together).")
 @click.option("--size", metavar="WxH", help="Size of the images in pixels.")
-@click.option("--seed", type=int, help="Another seed is another place.  [default: 0]")
+@click.option(
+    "--seed", type=int, help="Seed of the city; another one gives another city.  [default: 0]"
+)
 @click.option("--views", type=int, help="Mean number of images per period.")
 @click.option("--points", type=int, help="Number of sparse points to aim for.")
 @click.option("--noise", type=float, help="Noise of observed point positions in pixels.")
