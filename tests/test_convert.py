@@ -130,7 +130,9 @@ def test_a_folder_in_use_is_left_alone(make_scene_folder, tmp_path, target):
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("all of it")
-    with pytest.raises(SceneError, match="expected a new or empty folder, found one in use"):
+    with pytest.raises(
+        SceneError, match="expected a new or empty folder, found one that is not empty"
+    ):
         convert(make_scene_folder(), out, target=target)
     assert snapshot(out) == {"thesis.txt": hashlib.sha256(b"all of it").hexdigest()}
 

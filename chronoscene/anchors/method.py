@@ -199,7 +199,10 @@ class AnchorMethod(SplattingMethod):
     def restore(self, folder: Path, tensors: dict[str, Tensor], device: str) -> None:
         if not isinstance(self.meta.get("layout"), dict):
             raise CheckpointError(
-                folder / META_FILE, expected="a layout", found="none", todo="train again"
+                folder / META_FILE,
+                expected="the key layout",
+                found="none",
+                todo="the model is of another version: train again",
             )
         layout = AnchorLayout.from_meta(self.meta["layout"])
         self.config = dataclasses.replace(self.config, near_plane=layout.near_plane)

@@ -85,15 +85,15 @@ def _dates(images: Path, names: list[str]) -> dict[str, date]:
         if missing := [name for name in lost if not (images / name).is_file()]:
             raise SceneError(
                 images,
-                expected="a file of every image of the model",
-                found=f"none of {shown(missing)}",
+                expected="a file for every image of the model",
+                found=f"none for {shown(missing)}",
                 todo="copy the photos there, or name the periods with --period-by table:FILE",
             )
         raise SceneError(
             images,
-            expected="a date of every photo: EXIF DateTimeOriginal, or a file name that begins "
+            expected="a date for every photo: EXIF DateTimeOriginal, or a file name that begins "
             "with 2023-04-17 or 20230417",
-            found=f"none in {len(lost)} of {len(names)}: {shown(lost)}",
+            found=f"none for {len(lost)} of {len(names)}: {shown(lost)}",
             todo="name the periods of all photos with --period-by table:FILE, a CSV file with the "
             "columns file and period",
         )

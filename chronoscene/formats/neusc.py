@@ -71,7 +71,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
         raise SceneError(
             path / PLACE[1],
             expected="images with a date in their names",
-            found="none after train.txt and trash.txt",
+            found="none left by train.txt and trash.txt",
             todo="name images with their dates in train.txt, and not in trash.txt",
         )
     dated = [name for name in used if name in dates]

@@ -142,7 +142,7 @@ def load_depth(folder: Path, view: str, other: int | None) -> NDArray[np.floatin
     except (*UNREADABLE, TypeError) as error:
         raise ImageError(
             path,
-            expected="an array of the name depth in NumPy's npz format",
+            expected="an array named depth in NumPy's npz format",
             found=str(error) or type(error).__name__,
             todo="write the file again with numpy.savez",
         ) from error

@@ -166,7 +166,7 @@ def staged_folder(out: Path) -> Iterator[Path]:
             raise SceneError(
                 out,
                 expected="a new or empty folder",
-                found="one in use" if out.is_dir() else "a file",
+                found="one that is not empty" if out.is_dir() else "a file",
                 todo="choose another folder",
             )
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -73,8 +73,8 @@ def build_config(
             raise ConfigError(
                 f"{place} {key}",
                 expected=f"{idle[key]}, without which it has no effect",
-                found="another value",
-                todo="leave one of them out",
+                found="another value of that option",
+                todo=f"leave {key} out, or change that option",
             )
     return config
 

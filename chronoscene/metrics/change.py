@@ -91,6 +91,9 @@ def share_of_other(
     energy = float((change**2).sum())
     if energy == 0:
         raise ShapeError(
-            "other", expected="a change", found="none", todo="leave the pair of periods out"
+            "other",
+            expected="a change where pixels count",
+            found="none",
+            todo="leave this pair of periods out",
         )
     return float(((c - a)[counted] * change).sum()) / energy

@@ -109,7 +109,7 @@ def check_free(out: Path, *, overwrite: bool) -> None:
     raise SceneError(
         out,
         expected="a new or empty folder",
-        found="one in use",
+        found="one that is not empty",
         todo="choose another folder, or --overwrite if it is an earlier registration",
     )
 

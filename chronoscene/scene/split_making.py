@@ -326,8 +326,8 @@ def latest(scene: Scene, settings: SplitSettings, times: Times) -> set[str]:
     if lost := [f.name for f in scene.frames if f.name not in taken]:
         raise SceneError(
             scene.root,
-            expected="a date of capture of every image: EXIF DateTimeOriginal, or a file name that "
-            "begins with 2023-04-17 or 20230417",
+            expected="a date of capture for every image: EXIF DateTimeOriginal, or a file name "
+            "that begins with 2023-04-17 or 20230417",
             found=f"none for {len(lost)} of {len(scene.frames)} images, {lost[0]!r} for example",
             todo="choose another strategy, or hold out whole periods (--strategy periods)",
         )

@@ -80,7 +80,7 @@ def natural_resolution(scene: Scene, max_width: int) -> float:
     if not len(found):
         raise ConfigError(
             "--resolution",
-            expected="a resolution, as no training photo sees a sparse point",
+            expected="the size of a cell, as no training photo sees a sparse point",
             found="none",
             todo="add it, in metres",
         )

@@ -84,7 +84,7 @@ def map_frame(scene: Scene, crs: str | None) -> MapFrame:
     if not abs(made.scale - 1) <= MAX_SCALE_ERROR:  # nor if it is not finite
         raise ConfigError(
             f"--crs {name}",
-            expected="a reference system of this region whose metres are metres",
+            expected="a reference system whose scale is 1 in this region",
             found=f"scale {made.scale:.3g}",
             todo="choose another one, such as the zone of UTM",
         )

@@ -55,7 +55,7 @@ def check_views(state: TrainingState, views: int) -> None:
             "views_per_step",
             expected=str(begun),
             found=str(views),
-            todo="go on with as many threads as before, by which auto chose",
+            todo="continue with as many threads as before: views_per_step=auto depends on them",
         )
 
 

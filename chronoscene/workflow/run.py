@@ -55,7 +55,7 @@ def start(captures: Path, table: Path | None, out: Path, options: Options) -> tu
         raise SceneError(
             out,
             expected=f"a new or empty folder, or one with the {RECORD_FILE} of an earlier call",
-            found="one in use" if out.is_dir() else "a file",
+            found="one that is not empty" if out.is_dir() else "a file",
             todo="choose another folder",
         )
     record = new_record(*find_captures(captures, table), options)

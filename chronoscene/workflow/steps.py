@@ -162,7 +162,7 @@ def _validate(project: Project) -> Sequence[Path]:
         raise SceneError(
             project.scene,
             expected="a scene without errors",
-            found="some",
+            found="errors",
             todo=f"see {out / 'index.html'}",
         )
     return [out / "index.html"]

@@ -315,11 +315,11 @@ def test_dates_in_file_names_count_too(colmap_folder):
 
 def test_photos_without_a_date_are_named(colmap_folder):
     folder = dated_folder(colmap_folder, [*DAYS, None, None, None, None])
-    found = r"found none in 4 of 8: '4.jpg', '5.jpg', '6.jpg' and 1 more; .*--period-by table:FILE"
+    found = r"found none for 4 of 8: '4.jpg', '5.jpg', '6.jpg' and 1 more; .*--period-by table:FILE"
     with pytest.raises(SceneError, match=found):
         read_scene(folder, period_by="year")
     (folder / "images/5.jpg").unlink()
-    with pytest.raises(SceneError, match=r"expected a file of every image.*none of '5.jpg'; copy"):
+    with pytest.raises(SceneError, match=r"expected a file for every .*none for '5.jpg'; copy"):
         read_scene(folder, period_by="year")
 
 

@@ -115,7 +115,7 @@ def test_names_without_a_date_are_refused(pointz, name):
 
 
 def test_lists_that_leave_nothing(pointz):
-    with pytest.raises(SceneError, match=r"none after train\.txt and trash\.txt"):
+    with pytest.raises(SceneError, match=r"none left by train\.txt and trash\.txt"):
         read_scene(pointz(NAMES, train=["17", "18"]))
 
 

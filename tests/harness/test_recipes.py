@@ -108,7 +108,8 @@ def test_test_views_that_a_program_does_not_take_are_refused(bench_here, install
     outcome, _ = bench_here("baselines.external:CLNERF", overrides=installed("clnerf"))
     (failure,) = outcome.failures
     assert (
-        "in the format wat: expected what programs take that read it: every 8th" in failure.reason
+        "in the format wat: expected those that programs with this format use: every 8th"
+        in failure.reason
     )
     assert "chronoscene split SCENE --scene-out NEW" in failure.reason
 

@@ -82,6 +82,6 @@ def test_what_is_not_known_and_what_is_damaged(tmp_path):
     np.testing.assert_array_equal(load_depth(tmp_path, "x.jpg", 1), np.full((2, 3), 7.0))
     np.savez(path, other=np.ones(3))
     for _ in range(2):
-        with pytest.raises(ImageError, match=r"x__p1\.npz: expected an array of the name depth"):
+        with pytest.raises(ImageError, match=r"x__p1\.npz: expected an array named depth"):
             load_depth(tmp_path, "x.jpg", 1)
         path.write_bytes(path.read_bytes()[:50])

@@ -82,5 +82,5 @@ def test_a_ghost_outside_the_mask_is_none(truths):
     image = np.where(mask[..., None], own, other)
     assert share_of_other(image, own, other, mask) == 0
     assert share_of_other(image, own, other, ~mask) == pytest.approx(1)
-    with pytest.raises(ShapeError, match="expected a change, found none"):
+    with pytest.raises(ShapeError, match="expected a change where pixels count, found none"):
         share_of_other(image, own, own, mask)

@@ -250,7 +250,7 @@ def test_a_command_killed_again_and_again_ends_as_if_nothing_had_been(
 
 def test_a_place_in_use_is_refused(captures: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(SceneError, match="found one in use"):
+    with pytest.raises(SceneError, match="found one that is not empty"):
         run(read_captures(captures), tmp_path, OPTIONS)
 
 

@@ -86,7 +86,7 @@ def test_local_metres(scene):
         (WorldFrame("metre", PLACE.crs), "EPSG:6424", ConfigError, "found one in feet"),
         (WorldFrame("metre", PLACE.crs), "EPSG:99999", ConfigError, "that PROJ knows"),
         (WorldFrame("metre", PLACE.crs), "EPSG:5513", ConfigError, "axes point south and west"),
-        (WorldFrame("metre", PLACE.crs), "EPSG:32755", ConfigError, "metres are metres"),
+        (WorldFrame("metre", PLACE.crs), "EPSG:32755", ConfigError, "scale is 1 in this region"),
         (WorldFrame("metre", PLACE.crs), "EPSG:3857", ConfigError, r"found scale 1\.45"),
         (WorldFrame("metre", "EPSG:4326"), None, ConfigError, "found one in degrees"),
     ],

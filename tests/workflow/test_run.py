@@ -229,7 +229,7 @@ def test_wrong_options_are_refused_before_long_work(fake, options, error):
 def test_a_folder_with_other_content_is_refused(fake):
     fake.out.mkdir()
     (fake.out / "mine.txt").touch()
-    with pytest.raises(SceneError, match="found one in use; choose another folder"):
+    with pytest.raises(SceneError, match="found one that is not empty; choose another folder"):
         fake.go()
 
 

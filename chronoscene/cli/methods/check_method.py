@@ -67,8 +67,8 @@ def new(name: str, out: Path | None) -> None:
     if iskeyword(module) or find_spec(module) is not None:
         raise ConfigError(
             "NAME",
-            expected="one that no word or module of Python has",
-            found=f"{module!r}, whose package would stand in its place",
+            expected="a name that is neither a keyword nor a module of Python",
+            found=f"{module!r}, which the package would hide",
             todo="choose another name",
         )
     out = out or Path(name)

@@ -65,7 +65,10 @@ def command(
     pairs = parse_pairs(labels, between) or usual_pairs(run.num_periods)
     if not pairs:
         raise ConfigError(
-            folder, expected="a run of two periods or more", found="one", todo="open another run"
+            folder,
+            expected="a run of two periods or more",
+            found="one period",
+            todo="open another run",
         )
     found = run.scene(scene)
     check_outside(out, [found.root], option="--out")

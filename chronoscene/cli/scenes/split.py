@@ -129,7 +129,7 @@ def _check_targets(source: Path, out: Path | None, scene_out: Path | None) -> No
             out,
             expected="a name for the list that does not end in .json",
             found="one that does",
-            todo="name it test.txt; what made it goes to test.json beside it",
+            todo="name it test.txt; its settings are written to test.json beside it",
         )
     for file in (out, out and _json_beside(out)):
         if file is not None and file.exists():

@@ -96,7 +96,7 @@ def check_protocol(
 def _refusal(name: str, place: str, expected: str, found: str) -> ConfigError:
     return ConfigError(
         place,
-        expected=f"{expected}, as --protocol {name} has it",
+        expected=f"{expected}, as --protocol {name} requires",
         found=found,
         todo="correct it, or leave --protocol out",
     )

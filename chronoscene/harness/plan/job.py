@@ -77,7 +77,7 @@ class Job:
         if scene_stamp(scene) != self.scene_stamp and scene_hash(scene) != self.scene_hash:
             raise SceneError(
                 scene.root,
-                expected="the images, masks and model of which the run was planned",
+                expected="the images, masks and model for which the run was planned",
                 found="changes since then",
                 todo="run the same command again, which plans with the present files",
             )

@@ -230,7 +230,7 @@ def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[st
     if not fits_somewhere:
         raise ConfigError(
             wanted,
-            expected="limits to which some of the runs keep",
+            expected="limits that a trained run meets",
             found=f"none; nearest: {min(nearest)[1]}" if nearest else "no run that was trained",
             todo="allow more, or add runs of other presets and methods",
         )

@@ -211,9 +211,9 @@ def export_part(scene: Scene, part: Part, out: Path, format: str) -> dict[str, s
     if other := [old for old, view in views.items() if (view.split == "test") == (old in trained)]:
         raise ProgramError(
             f"test views of a training set in the format {format}",
-            expected=f"what programs take that read it: {written.split_rule}",
-            found=f"others, as {shown(other)}",
-            todo="choose the test views so: chronoscene split SCENE --scene-out NEW",
+            expected=f"those that programs with this format use: {written.split_rule}",
+            found=f"other ones: {shown(other)}",
+            todo="make a scene with them: chronoscene split SCENE --scene-out NEW",
         )
     return {old: view.name for old, view in views.items()}
 

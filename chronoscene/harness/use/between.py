@@ -44,7 +44,7 @@ def parse_dates(run: TrainedRun, text: str) -> tuple[int, int]:
         raise ConfigError(
             f"--periods {text}",
             expected="two neighbouring periods as FROM:TO, such as 0:1",
-            found="others" if len(found) == 2 else "one period",
+            found="periods that are not neighbours" if len(found) == 2 else "one period",
             todo="name two periods with no other between them",
         )
     return int(found[0]), int(found[1])

@@ -244,8 +244,8 @@ def _fit(model: _SortedModel, max_loss: float, log: Log) -> dict[str, Columns]:
         if low < LEAST:
             raise ConfigError(
                 f"--max-loss {max_loss:g}",
-                expected="a loss that rounding can keep to",
-                found="a larger one with half floats and positions on a grid alone",
+                expected="a loss within reach of this model",
+                found="a larger loss from half floats and gridded positions alone",
                 todo="allow more, or use --plain",
             )
     for _ in range(ROUNDS):

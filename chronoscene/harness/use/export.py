@@ -86,7 +86,7 @@ def prepare(run: TrainedRun, scene: Scene, period: float, viewers: str | None = 
     if viewers == "antialiased" and not run.is_filtered:
         raise ConfigError(
             "--for antialiased",
-            expected="a run that was trained with the filter of antialiased",
+            expected="a run that was trained with antialiased=true",
             found="one without it",
             todo="leave it out",
         )

@@ -153,7 +153,10 @@ def _check_images(image: Tensor, target: Tensor) -> None:
     check_shape("target", target, tuple(image.shape))
     if image.numel() == 0:
         raise ShapeError(
-            "image", expected="at least one pixel", found=str(list(image.shape)), todo="render more"
+            "image",
+            expected="at least one pixel",
+            found=str(list(image.shape)),
+            todo="render at least one pixel",
         )
     known = target.dtype == torch.uint8 or target.is_floating_point()
     if not image.is_floating_point() or not known:

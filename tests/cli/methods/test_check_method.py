@@ -48,7 +48,7 @@ def test_wrong_names_and_places_are_refused(tmp_path):
         with pytest.raises(ConfigError, match="a small letter, then small letters and digits"):
             run("new-method", name, "--out", tmp_path / "new")
     for name in ("class", "torch", "chronogs"):
-        with pytest.raises(ConfigError, match=f"'{name}', whose package would stand in its place"):
+        with pytest.raises(ConfigError, match=f"'{name}', which the package would hide"):
             run("new-method", name, "--out", tmp_path / "new")
     (tmp_path / "used").mkdir()
     (tmp_path / "used/file").touch()

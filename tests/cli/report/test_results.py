@@ -210,7 +210,7 @@ def test_names_and_columns_can_be_chosen(tmp_path):
     ("option", "message"),
     [
         (("--rename", "5DGS=x"), "--rename 5DGS=x: expected a part of names"),
-        (("--rename", "3DGS=4DGS"), "names that differ afterwards, too"),
+        (("--rename", "3DGS=4DGS"), "names that still differ afterwards"),
         (("--rename", "3DGS"), "--rename: expected OLD=NEW"),
         (("--columns", "macros"), "--columns: expected one of .*macro"),
         (("--columns", "macro", "--format", "csv"), "--columns: expected none with csv"),

@@ -86,7 +86,10 @@ def test_whole_periods_are_remarked_upon(scene, tmp_path):
         (["{scene}", "{tmp}/there.txt"], "expected a new file, found an existing one"),
         (["{scene}", "{tmp}/other.txt"], "other.json: expected a new file"),
         (["{scene}", "{tmp}/there.txt/o"], "expected a file that can be written"),
-        (["{scene}", "{tmp}/o", "--strategy", "date"], "expected a date of capture of every image"),
+        (
+            ["{scene}", "{tmp}/o", "--strategy", "date"],
+            "expected a date of capture for every image",
+        ),
         (["{scene}", "{tmp}/o", "--fraction", "2"], "--fraction: expected a number between 0 and"),
         (["{tmp}/nowhere", "{tmp}/o"], "expected a scene folder, found nothing"),
     ],

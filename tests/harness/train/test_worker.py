@@ -122,7 +122,7 @@ def test_a_run_is_recorded_only_with_the_photos_of_its_plan(
     assert len(outcome.finished) == (changed != "photo")
     for failure in outcome.failures:
         assert failure.reason == (
-            f"{folder}: expected the images, masks and model of which the run was planned, found "
+            f"{folder}: expected the images, masks and model for which the run was planned, found "
             "changes since then; run the same command again, which plans with the present files"
         )
 

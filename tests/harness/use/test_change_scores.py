@@ -147,7 +147,9 @@ def test_places_that_are_refused(run, scene, tmp_path):
         changes(run.folder, "--scene", scene.root, "--out", scene.root / "out")
     (tmp_path / "used").mkdir()
     (tmp_path / "used/file").touch()
-    with pytest.raises(SceneError, match="expected a new or empty folder, found one in use"):
+    with pytest.raises(
+        SceneError, match="expected a new or empty folder, found one that is not empty"
+    ):
         changes(run.folder, "--scene", scene.root, "--out", tmp_path / "used")
 
 
