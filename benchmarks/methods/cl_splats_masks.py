@@ -14,10 +14,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import numpy as np
 
 from baselines.cl_splats import SPEC

@@ -13,10 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure

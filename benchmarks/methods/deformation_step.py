@@ -15,10 +15,6 @@ import argparse
 import time
 from typing import Any
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import numpy as np
 import torch
 

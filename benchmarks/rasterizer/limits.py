@@ -17,10 +17,6 @@ from collections.abc import Callable
 from statistics import median
 from typing import Any, NamedTuple
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import numpy as np
 from numba import types
 from numba.core import cgutils

@@ -165,9 +165,6 @@ class Process:
 
 def work(arguments: Sequence[str], inputs: IO[str]) -> None:
     """Render in the process of a variant: once for the errors, then at each line of input."""
-    import chronoscene  # noqa: F401
-
-    # isort: split
     from benchmarks.rasterizer.peers import cpu
     from benchmarks.rasterizer.scenes import surfaces
     from chronoscene.kernels.runtime import set_threads

@@ -17,10 +17,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import numpy as np
 import torch
 from llvmlite import ir

@@ -19,10 +19,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 from chronoscene.harness.files.provenance import code_version, processor_name
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import load_spec, method_names

@@ -20,10 +20,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import cycle
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import torch
 from torch import Tensor
 

@@ -38,10 +38,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import torch
 
 from baselines.deformation_4dgs import model as deformed_model

@@ -20,10 +20,6 @@ from itertools import product
 from pathlib import Path
 from statistics import median
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import numpy as np
 
 from benchmarks.training.generated import PROGRESS, make, training_set

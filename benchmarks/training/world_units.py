@@ -14,10 +14,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-# Before torch: it says how idle threads wait.
-import chronoscene  # noqa: F401
-
-# isort: split
 import numpy as np
 
 from chronogs import SPEC
