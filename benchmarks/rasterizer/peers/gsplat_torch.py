@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
-from benchmarks.rasterizer.peers import UnavailableError
+from benchmarks.rasterizer.peers import UnavailableError, by_autograd
 from benchmarks.rasterizer.scenes import Scene
 
 NAME = "gsplat torch"
@@ -25,17 +24,10 @@ def make(scene: Scene) -> Callable[[bool], Tensor]:
     except Exception as error:
         raise UnavailableError(f"{type(error).__name__}: {error}") from error
 
-    def run(backward: bool) -> Tensor:
-        scene.drop_gradients()
-        arrays = (*scene.gaussians, scene.viewmats, scene.Ks, scene.width, scene.height)
-        with torch.set_grad_enabled(backward):
-            image: Tensor = _rasterization(*arrays)[0]
-            if backward:
-                image.backward(scene.image_grad)
-        return image[0].detach()
-
+    arrays = (*scene.gaussians, scene.viewmats, scene.Ks, scene.width, scene.height)
+    run = by_autograd(scene, lambda: _rasterization(*arrays)[0])
     try:
-        run(backward=False)
+        run(False)
     except Exception as error:  # whatever it fails with is what the table shall say
         reason = str(error).strip().splitlines() or [""]
         raise UnavailableError(f"{type(error).__name__}: {reason[0]}") from error

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from benchmarks.rasterizer.peers import by_autograd
 from benchmarks.rasterizer.peers.projection import project
 from benchmarks.rasterizer.scenes import Scene
 from chronoscene.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -22,16 +23,7 @@ TILE = 16
 
 def make(scene: Scene) -> Callable[[bool], Tensor]:
     """Rendering of a scene, with gradients of all inputs if asked for."""
-
-    def run(backward: bool) -> Tensor:
-        scene.drop_gradients()
-        with torch.set_grad_enabled(backward):
-            image = render(scene)
-            if backward:
-                image.backward(scene.image_grad[0])
-        return image.detach()
-
-    return run
+    return by_autograd(scene, lambda: render(scene)[None])
 
 
 def render(scene: Scene) -> Tensor:
