@@ -247,6 +247,14 @@ def set_zero(memory, start, stop):  # type: ignore[no-untyped-def]
         store_first(memory, i, splat(float32(0)), stop - i)
 
 
+@emitted(lambda addresses, count: addresses(addresses, types.intp))
+def moved(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Named tuple of addresses, each ``count`` float32 further."""
+    move = builder.mul(args[1], args[1].type(4))
+    parts = cgutils.unpack_tuple(builder, args[0], len(sig.args[0]))
+    return context.make_tuple(builder, sig.return_type, [builder.add(x, move) for x in parts])
+
+
 def place(sizes: Sequence[int], address: int) -> list[int]:
     """Addresses of arrays of float32 that lie one after the other."""
     return [address + 4 * sum(sizes[:i]) for i in range(len(sizes))]

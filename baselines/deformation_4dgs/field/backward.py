@@ -18,14 +18,14 @@ from baselines.deformation_4dgs.field.forward import (
     find_cell,
     gather_features,
     hidden_layers,
-    worker_space,
 )
-from baselines.deformation_4dgs.field.layout import BLOCK, COLORS, SMALL, Gradients
+from baselines.deformation_4dgs.field.layout import BLOCK, COLORS, SMALL
 from chronoscene.kernels.compilation import inlined, inner, kernel
 from chronoscene.kernels.matmul import product
 from chronoscene.kernels.memory import (
     load,
     load_first,
+    moved,
     read,
     read_index,
     set_zero,
@@ -295,22 +295,11 @@ def deform_backward(  # type: ignore[no-untyped-def]
         partial: `Gradients` of the first part, in the end of all; those of other parts follow.
         partial_size: Numbers in it.
     """
-    own, parts = worker_space(work, number, size), max(1, (count + rows - 1) // rows)
+    own, parts = moved(work, number * size), max(1, (count + rows - 1) // rows)
     part = draw(control, 0)
     while part < parts:
-        move = 4 * part * partial_size
-        set_zero(partial.planes + move, 0, partial_size)
-        sums = Gradients(
-            partial.planes + move,
-            partial.trunk_t + move,
-            partial.trunk_bias + move,
-            partial.hidden_t + move,
-            partial.hidden_bias + move,
-            partial.small + move,
-            partial.small_bias + move,
-            partial.color + move,
-            partial.color_bias + move,
-        )
+        sums = moved(partial, part * partial_size)
+        set_zero(sums.planes, 0, partial_size)
         begin, end = part * rows, min((part + 1) * rows, count)
         _part_gradient(layout, planes, weights, means, grads, begin, end, unit, own, sums, out)
         finish(control, 0)

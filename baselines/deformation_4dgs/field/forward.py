@@ -4,33 +4,25 @@ from __future__ import annotations
 
 from numpy import float32
 
-from baselines.deformation_4dgs.field.layout import BLOCK, COLORS, SMALL, Work
+from baselines.deformation_4dgs.field.layout import BLOCK, COLORS, SMALL
 from chronoscene.kernels.compilation import inlined, inner, kernel
 from chronoscene.kernels.matmul import product, relu_product
-from chronoscene.kernels.memory import load, load_first, read, read_index, store, store_first, write
+from chronoscene.kernels.memory import (
+    load,
+    load_first,
+    moved,
+    read,
+    read_index,
+    store,
+    store_first,
+    write,
+)
 from chronoscene.kernels.thread_pool import draw
 from chronoscene.kernels.vectors import LANES
 
 ZERO = float32(0)
 ONE = float32(1)
 REST = COLORS - 3  # Coefficients of a Gaussian above the constant ones
-
-
-@inner
-def worker_space(work, number, size):  # type: ignore[no-untyped-def]
-    """Work space of a worker; ``size`` numbers after that of the worker before."""
-    move = 4 * number * size
-    return Work(
-        work.rows + move,
-        work.x + move,
-        work.trunk + move,
-        work.hidden + move,
-        work.small + move,
-        work.colors + move,
-        work.d_hidden + move,
-        work.d_trunk + move,
-        work.d_x + move,
-    )
 
 
 @inner
@@ -152,7 +144,7 @@ def deform_forward(number, control, layout, planes, weights, source, count, unit
         work: `Work` of the first worker, finite numbers.
         size: Numbers in it.
     """
-    own = worker_space(work, number, size)
+    own = moved(work, number * size)
     begin = BLOCK * draw(control, 0)
     while begin < count:
         rows = min(BLOCK, count - begin)

@@ -14,16 +14,16 @@ from chronoscene.anchors.decode.forward import (
     factors,
     gather_inputs,
     hidden_layer,
-    task_work,
     tiled,
 )
-from chronoscene.anchors.decode.layout import BLOCK, CHUNK, CYCLE, Gradients
+from chronoscene.anchors.decode.layout import BLOCK, CHUNK, CYCLE
 from chronoscene.anchors.decode.second_layers import add_biases, add_offset
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.matmul import product
 from chronoscene.kernels.memory import (
     load,
     load_first,
+    moved,
     read,
     read_index,
     set_zero,
@@ -238,15 +238,12 @@ def decode_backward(  # type: ignore[no-untyped-def]
     # One at least: where nothing is visible, it sets the gradients to zero.
     chunks = max(1, (source.num_visible + CHUNK - 1) // CHUNK)
     for task in prange(tasks):
-        own = task_work(work, task, work_size)
+        own = moved(work, task * work_size)
         for chunk in range(task, chunks, tasks):
             begin = chunk * CHUNK
             end = min(begin + CHUNK, source.num_visible)
-            move = 4 * chunk * size
-            set_zero(partial.w1_t + move, 0, size)
-            part = Gradients(
-                partial.w1_t + move, partial.b1 + move, partial.w2 + move, partial.b2 + move
-            )
+            part = moved(partial, chunk * size)
+            set_zero(part.w1_t, 0, size)
             _chunk_gradient(layout, weights, source, outputs, grads, begin, end, own, part, out)
     for i in prange((size + SLICE - 1) // SLICE):
         for j in range(i * SLICE, min((i + 1) * SLICE, size), LANES):

@@ -11,13 +11,14 @@ import math
 from numba import prange
 from numpy import float32
 
-from chronoscene.anchors.decode.layout import BLOCK, CHUNK, MIN_DISTANCE, MIN_QUAT_NORM, Work
+from chronoscene.anchors.decode.layout import BLOCK, CHUNK, MIN_DISTANCE, MIN_QUAT_NORM
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.matmul import ROW_TILE, product, relu_product
 from chronoscene.kernels.memory import (
     copy_quad,
     load,
     load_first,
+    moved,
     prefetch,
     read,
     read_index,
@@ -36,28 +37,6 @@ ZERO = float32(0)
 ONE = float32(1)
 _MIN_DISTANCE = float32(MIN_DISTANCE)
 _MIN_SQUARE = float32(MIN_QUAT_NORM**2)
-
-
-@inner
-def task_work(work, task, size):  # type: ignore[no-untyped-def]
-    """Return the work space of a task, ``size`` numbers after that of the task before."""
-    move = 4 * task * size
-    return Work(
-        work.rows + move,
-        work.counts + move,
-        work.slots + move,
-        work.x + move,
-        work.hidden + move,
-        work.raw + move,
-        work.d_hidden + move,
-        work.d_x + move,
-        work.row + move,
-        work.opacities + move,
-        work.scales + move,
-        work.quats + move,
-        work.colors + move,
-        work.factors + move,
-    )
 
 
 @inner
@@ -162,7 +141,7 @@ def decode_opacities(layout, weights, source, above, out, work, work_size, tasks
         tasks: Into how many tasks to divide the work; does not change the result.
     """
     for task in prange(tasks):
-        own = task_work(work, task, work_size)
+        own = moved(work, task * work_size)
         for begin in range(task * BLOCK, source.num_visible, tasks * BLOCK):
             count = min(BLOCK, source.num_visible - begin)
             for i in range(count):
@@ -255,7 +234,7 @@ def _decode_block(layout, weights, source, count, above, work, out):  # type: ig
 def decode_forward(layout, weights, source, above, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
     """Do the second pass: all of the active Gaussians; arguments as `decode_opacities`."""
     for task in prange(tasks):
-        own = task_work(work, task, work_size)
+        own = moved(work, task * work_size)
         for begin in range(task * CHUNK, source.num_visible, tasks * CHUNK):
             end = min(begin + CHUNK, source.num_visible)
             count = 0
