@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.data.dataset_scale import measure_command
+from benchmarks.markdown import exponents, table
 from chronoscene.edit import Edits, edit
 from chronoscene.formats import read_scene
 from chronoscene.harness.files.provenance import code_version, processor_name
@@ -141,24 +142,20 @@ def size_of(path: Path) -> int:
     return sum(p.stat().st_size for p in (path, *path.rglob("*")) if p.is_file())
 
 
-def table(figures: Mapping[int, Figures], of: str) -> str:
+def tables(figures: Mapping[int, Figures], of: str) -> str:
     """Each measure by command and number of photos or anchors, with exponents, as Markdown."""
     sizes = list(figures)
     growth = [f"{a:,} to {b:,}" for a, b in pairwise(sizes)]
-    lines = []
+    found = []
     for title, key, digits in MEASURES:
-        heads = [f"{title}: {sizes[0]:,} {of}", *(f"{n:,}" for n in sizes[1:]), *growth]
-        lines += ["| | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
+        heads = ["", f"{title}: {sizes[0]:,} {of}", *(f"{n:,}" for n in sizes[1:]), *growth]
+        rows = []
         for name in next(iter(figures.values())):
             values = [figures[n][name][key] if name in figures[n] else None for n in sizes]
             texts = ["-" if value is None else f"{value:,.{digits}f}" for value in values]
-            powers = [
-                f"{math.log(b / a) / math.log(n / m):.2f}" if a and b else "-"
-                for (a, b), (m, n) in zip(pairwise(values), pairwise(sizes), strict=True)
-            ]
-            lines.append(f"| {name} | " + " | ".join([*texts, *powers]) + " |")
-        lines.append("")
-    return "\n".join(lines)
+            rows.append([name, *texts, *exponents(values, sizes)])
+        found.append(table(heads, rows) + "\n")
+    return "\n".join(found)
 
 
 def about(scene: Path) -> str:
@@ -216,7 +213,7 @@ def main() -> None:
         found[number_of(folder, case, methods[0], of)] = figures
     shutil.rmtree(folder / "out", ignore_errors=True)
     print(f"{processor_name()}, commit {code_version()}, {steps} steps")
-    print(*dict.fromkeys(about(case.scene) for case in cases), "", table(found, of), sep="\n")
+    print(*dict.fromkeys(about(case.scene) for case in cases), "", tables(found, of), sep="\n")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.markdown import table
 from chronoscene.harness.files.records import RunRecord, read_run
 from chronoscene.harness.plan.settings import bench_settings
 from chronoscene.harness.study.plan import find_study, read_study, run_study
@@ -60,8 +61,7 @@ def main() -> None:
     settings = bench_settings([given.scene], (), given.out, **options)
     _, finished = run_study(read_study(find_study(given.study)), settings, print)
     runs = {label: [read_run(folder) for folder in folders] for label, folders in finished.items()}
-    for cells in (HEADS, ["---", *["---:"] * (len(HEADS) - 1)], *table_rows(runs)):
-        print("|", " | ".join(cells), "|")
+    print(table(HEADS, table_rows(runs)))
 
 
 if __name__ == "__main__":

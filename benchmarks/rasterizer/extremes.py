@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+from benchmarks.markdown import replace_part, table
+from chronoscene.harness.files.provenance import processor_name
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "rasterizer"))
@@ -23,23 +25,7 @@ comparison: Any = import_module("rasterizer_cases.comparison")
 extremes: Any = import_module("rasterizer_cases.extremes")
 
 README = ROOT / "chronoscene" / "rasterizer" / "README.md"
-BEGIN, END = "<!-- extremes: begin -->", "<!-- extremes: end -->"
 GRADIENTS = ("means", "quats", "scales", "opacities", "colors")
-
-
-def processor() -> str:
-    """Name of the processor."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else "an unknown processor"
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table in Markdown, numbers to the right."""
-    head = list(head)
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def number(x: float) -> str:
@@ -56,7 +42,8 @@ def errors_of(compared: Any) -> dict[str, float]:
 
 def outcomes() -> str:
     """Describe the outcome at each extreme."""
-    return table(("extreme", "what happens"), ((e.name, e.why) for e in extremes.EXTREMES))
+    rows = ((e.name, e.why) for e in extremes.EXTREMES)
+    return table(("extreme", "what happens"), rows, numbers=False)
 
 
 def measured() -> str:
@@ -73,7 +60,7 @@ def measured() -> str:
         cells = [*(errors[c] for c in columns), moved["image"], moved["gradients"]]
         rows.append([extreme.name, *map(number, cells), f"{left_out:.1f}"])
     head = ("extreme", "image", "alpha", "depth", *("∂ " + name for name in GRADIENTS))
-    return table((*head, "inputs: image", "inputs: ∂", "left out, %"), rows)
+    return table((*head, "inputs: image", "inputs: ∂", "left out, %"), rows, numbers=False)
 
 
 def survey() -> str:
@@ -89,7 +76,7 @@ def survey() -> str:
         ):
             errors = errors_of(comparison.compare(scene, truth=truth))
             rows.append([name, given, number(errors["image"]), number(errors["gradients"])])
-    return table(("coordinates", "given as", "image", "gradients"), rows)
+    return table(("coordinates", "given as", "image", "gradients"), rows, numbers=False)
 
 
 def report() -> str:
@@ -111,7 +98,7 @@ the reference itself does when
 every input is moved by up to one unit of its last float32 place: the error that float32 inputs \
 have before anything is computed.
 "left out" are pixels where rounding decides a threshold. \
-`python -m benchmarks.rasterizer.extremes --write`, {processor()}.
+`python -m benchmarks.rasterizer.extremes --write`, {processor_name()}.
 
 {measured()}
 
@@ -128,12 +115,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--write", action="store_true", help=f"write them to {README.name}")
     text = report()
-    if not parser.parse_args().write:
+    if parser.parse_args().write:
+        replace_part(README, "extremes", text)
+    else:
         print(text)
-        return
-    before, rest = README.read_text("utf-8").split(BEGIN)
-    after = rest.split(END)[1]
-    README.write_text(f"{before}{BEGIN}\n{text}{END}{after}", "utf-8")
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.markdown import table
 from benchmarks.registration.generated import CaseSettings, generate_case
 from benchmarks.registration.images import run_images
 from benchmarks.registration.outcomes import REFUSED, Outcome, judged, load, save
@@ -146,8 +147,8 @@ def confusion(outcomes: list[Outcome]) -> str:
 
 def compare(before: list[Outcome], after: list[Outcome]) -> str:
     """Verdicts of two versions on the same cases, as a table of Markdown."""
-    heads = " | ".join(f"{level}, {when}" for level in LEVELS for when in ("before", "after"))
-    lines = [f"| | {heads} |", "| --- |" + " ---: |" * 2 * len(LEVELS)]
+    heads = [f"{level}, {when}" for level in LEVELS for when in ("before", "after")]
+    rows = []
     for family in ["all", *dict.fromkeys(o.family for o in after)]:
         for right in (True, False):
             pairs = [
@@ -159,9 +160,8 @@ def compare(before: list[Outcome], after: list[Outcome]) -> str:
                 str(sum(pair[i] == level for pair in pairs)) for level in LEVELS for i in (0, 1)
             )
             if pairs:
-                name = f"{family}, {'right' if right else 'wrong'}"
-                lines.append(f"| {name} | {' | '.join(counts)} |")
-    return "\n".join(lines)
+                rows.append([f"{family}, {'right' if right else 'wrong'}", *counts])
+    return table(["", *heads], rows)
 
 
 def errors_table(outcomes: list[Outcome]) -> str:

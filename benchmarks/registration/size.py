@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import time
 from collections import defaultdict
@@ -21,10 +20,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import wraps
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from benchmarks.markdown import exponents, table
 from benchmarks.registration import outcomes as shared
 from benchmarks.registration.images import ImageCase, make_photos, true_poses
 from chronoscene.harness.files.provenance import code_version, peak_memory_bytes, processor_name
@@ -190,26 +191,16 @@ def _counts(model: Registered, matches: Mapping[str, Any]) -> dict[str, int]:
     }
 
 
-def table(runs: Sequence[Mapping[str, Any]]) -> str:
+def growth_table(runs: Sequence[Mapping[str, Any]]) -> str:
     """Seconds and memory by stage and number of photos, with exponents, as Markdown."""
     sizes = [figures["photos"] for figures in runs]
-    heads = [f"{n} photos" for n in sizes]
-    steps = [(i, i + 1) for i in range(len(runs) - 1)]
-    growth = [f"{sizes[i]} to {sizes[j]}" for i, j in steps]
-    lines = [
-        "| | " + " | ".join([*heads, *growth]) + " |",
-        "| --- |" + " ---: |" * (len(heads) + len(growth)),
-    ]
+    growth = [f"{a} to {b}" for a, b in pairwise(sizes)]
+    heads = ["", *(f"{n} photos" for n in sizes), *growth]
+    rows = []
 
     def row(name: str, values: Sequence[float], texts: Sequence[str], least: float) -> None:
         """Add a row, with exponents where the values are large enough to have any."""
-        powers = [
-            f"{math.log(values[j] / values[i]) / math.log(sizes[j] / sizes[i]):.2f}"
-            if min(values[i], values[j]) > least
-            else "-"
-            for i, j in steps
-        ]
-        lines.append("| " + " | ".join([name, *texts, *powers]) + " |")
+        rows.append([name, *texts, *exponents(values, sizes, least)])
 
     for name in runs[0]["counts"]:
         numbers = [figures["counts"][name] for figures in runs]
@@ -226,8 +217,8 @@ def table(runs: Sequence[Mapping[str, Any]]) -> str:
         f"{r:.3f}°, {c:.3f} %, {figures['verdict']}"
         for (r, c), figures in zip(errors, runs, strict=True)
     ]
-    lines.append("| " + " | ".join(["worst date, verdict", *worst, *("" for _ in steps)]) + " |")
-    return "\n".join(lines)
+    rows.append(["worst date, verdict", *worst, *("" for _ in growth)])
+    return table(heads, rows)
 
 
 def main() -> None:
@@ -250,7 +241,7 @@ def main() -> None:
             file.write_text(text + "\n", encoding="utf-8")
         runs.append(json.loads(file.read_text(encoding="utf-8")))
         print(runs[-1]["machine"], *runs[-1]["remarks"], sep="\n  ", flush=True)
-    print("\n" + table(runs))
+    print("\n" + growth_table(runs))
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import chronoscene as cs
+from benchmarks.markdown import table
 from chronoscene.edit import Edits, edit
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.trained_run import TrainedRun
@@ -37,6 +38,8 @@ from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.tracks import track_owners
 
 Mask = NDArray[np.bool_]
+
+HEADS = ("", "PSNR", "near the cut", "Gaussians of all periods", "longest training, s")
 
 
 def cut_of(scene: Scene) -> tuple[int, float]:
@@ -139,12 +142,12 @@ def main() -> None:
         "one model": (sum(map(len, one)), run.record.seconds),
         "joined": (sum(map(len, two)), max(block.record.seconds or 0.0 for block in blocks)),
     }
-    print("| | PSNR | near the cut | Gaussians of all periods | longest training, s |")
-    print("| --- | ---: | ---: | ---: | ---: |")
+    rows = []
     for name, values in scores.items():
         everywhere, seam = np.nanmean(np.array(values), axis=0)
         gaussians, seconds = numbers[name]
-        print(f"| {name} | {everywhere:.2f} | {seam:.2f} | {gaussians:,} | {seconds:.0f} |")
+        rows.append((name, f"{everywhere:.2f}", f"{seam:.2f}", f"{gaussians:,}", f"{seconds:.0f}"))
+    print(table(HEADS, rows))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from benchmarks.markdown import replace_part, table
 from chronoscene.harness.files.provenance import code_version, processor_name
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import load_spec, method_names
@@ -29,7 +30,6 @@ sys.path.insert(0, str(ROOT / "tests" / "methods" / "support"))
 extremes: Any = import_module("extreme_trainings")
 
 PAGE = ROOT / "docs" / "experiments" / "training-extremes.md"
-BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 FIRST = ("fast", "paper")  # Presets that all extremes have before any other is tried
 RANKS = ("trained", "worse", "error", "traceback")
 """Outcomes, best first; worse: than the model was at its start, by more than `TOLERANCE`."""
@@ -78,17 +78,17 @@ def cell(results: Sequence[Result], presets: int, errors: list[str]) -> str:
     return text if len(results) == presets else f"{text} ({len(results)} of {presets})"
 
 
-def table(results: Sequence[Result], chosen: Sequence[Any], names: Sequence[str]) -> str:
+def worst_outcomes(results: Sequence[Result], chosen: Sequence[Any], names: Sequence[str]) -> str:
     """Table of the worst outcomes in Markdown, and the errors below it."""
     errors: list[str] = []
-    lines = [("extreme", *names), ("---",) * (len(names) + 1)]
+    lines = []
     for extreme in chosen:
         cells = []
         for name in names:
             found = [r for r in results if (r["extreme"], r["method"]) == (extreme.name, name)]
             cells.append(cell(found, len(load_spec(name).presets), errors))
         lines.append((extreme.name, *cells))
-    rows = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    rows = table(("extreme", *names), lines, numbers=False)
     notes = "".join(f"{i}. {message}\n" for i, message in enumerate(errors, start=1))
     return f"{rows}\n" + (f"\n{notes}" if notes else "")
 
@@ -124,13 +124,11 @@ def main() -> None:
         print(f"{extreme.name}, {name}, {preset}:", *shown, file=sys.stderr, flush=True)
     commits = ", ".join(dict.fromkeys(result["commit"][:7] for result in results))
     machine = f"{processor_name()}, threads: {threads}, commit {commits or code_version()}, seed 0."
-    text = f"{machine}\n\n{table(results, chosen, args.method)}"
-    if not args.write:
+    text = f"{machine}\n\n{worst_outcomes(results, chosen, args.method)}"
+    if args.write:
+        replace_part(PAGE, "table", text)
+    else:
         print(text)
-        return
-    before, rest = PAGE.read_text("utf-8").split(BEGIN)
-    after = rest.split(END)[1]
-    PAGE.write_text(f"{before}{BEGIN}\n{text}{END}{after}", "utf-8")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from benchmarks.registration.size import COMMAND, TASKS, Clock, table, timed
+from benchmarks.registration.size import COMMAND, TASKS, Clock, growth_table, timed
 from chronoscene.registration import output, pipeline
 
 
@@ -37,8 +37,8 @@ def test_growth_is_the_exponent_between_neighbouring_sizes() -> None:
         }
         for n in (10, 40)
     ]  # fmt: skip
-    rows = table(runs).splitlines()
-    assert rows[0] == "| | 10 photos | 40 photos | 10 to 40 |"
+    rows = growth_table(runs).splitlines()
+    assert rows[0] == "|  | 10 photos | 40 photos | 10 to 40 |"
     assert rows[2] == "| pairs | 100 | 1,600 | 2.00 |"
     assert rows[3] == "| mapping | 31.6 s, 2.00 GB | 253.0 s, 2.00 GB | 1.50 |"
     assert rows[4] == "| page | 0.1 s, 1.00 GB | 0.1 s, 1.00 GB | - |"
