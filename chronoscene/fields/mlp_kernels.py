@@ -16,6 +16,7 @@ from numpy import empty, empty_like, float32
 from numpy.typing import NDArray
 
 from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.kernels.layers import add_column_sums, keep_active
 from chronoscene.kernels.matmul import product, relu_product
 from chronoscene.kernels.memory import load, load_first, set_zero, store, store_first
 from chronoscene.kernels.vector_math import sigmoid
@@ -146,15 +147,6 @@ def mlp_forward(layers, weights, x, shared, starts, groups, chunks, out):  # typ
 
 
 @inner
-def _column_sums(rows, width, total, at):  # type: ignore[no-untyped-def]
-    for c in range(0, width, LANES):
-        value = load(total, at + c)
-        for i in range(BLOCK):
-            value = value + load(rows, i * width + c)
-        store(total, at + c, value)
-
-
-@inner
 def _output_gradient(layers, out, grads, row, count, target):  # type: ignore[no-untyped-def]
     """Gradient before the last activation; True if any number is not zero."""
     width = layers.widths[-1]
@@ -182,11 +174,7 @@ def _shared_gradient(layers, weights, shared, first, last, work, common, part, d
         at = (group - first) * hidden
         for i in range(count, BLOCK):
             set_zero(common, at + i * hidden, at + (i + 1) * hidden)
-        for c in range(0, hidden, LANES):
-            total = load(part, layers.bias[0] + c)
-            for i in range(BLOCK):
-                total = total + load(common, at + i * hidden + c)
-            store(part, layers.bias[0] + c, total)
+        add_column_sums(common, at, BLOCK, hidden, part, layers.bias[0])
         if pad == 0:
             continue
         _copy_rows(shared, group, layers.shared, work, pad, count)
@@ -243,7 +231,7 @@ def mlp_backward(  # type: ignore[no-untyped-def]
                 into = (part, layers.matrix[layer], outputs)
                 product(turned, (d, 0, outputs), into, into, inputs, outputs, BLOCK)
                 if layer:
-                    _column_sums(d, outputs, part, layers.bias[layer])
+                    add_column_sums(d, 0, BLOCK, outputs, part, layers.bias[layer])
                 else:
                     for i in range(count):
                         place = (groups[row + i] - first) * hidden
@@ -254,10 +242,7 @@ def mlp_backward(  # type: ignore[no-untyped-def]
                 nothing, rows = (zeros, 0, 0), (before, 0, inputs)
                 product((d, 0, outputs, 1), back, nothing, rows, BLOCK, inputs, outputs)
                 if layer:
-                    zero = splat(ZERO)
-                    for i in range(0, BLOCK * inputs, LANES):
-                        value = select(zero < load(left[0], left[1] + i), load(before, i), zero)
-                        store(before, i, value)
+                    keep_active(left[0], left[1], before, BLOCK * inputs)
                 d, before = before, d
             width = layers.widths[0]
             for i in range(count):

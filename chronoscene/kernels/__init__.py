@@ -1,4 +1,4 @@
-"""Building blocks of compiled kernels: SIMD vectors, their memory, matrix products, threads.
+"""Building blocks of compiled kernels: SIMD vectors, memory, matrix products, layers, threads.
 
 What this stands on, and what may break with another version of Numba or llvmlite:
 

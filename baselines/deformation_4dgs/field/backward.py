@@ -21,6 +21,7 @@ from baselines.deformation_4dgs.field.forward import (
 )
 from baselines.deformation_4dgs.field.layout import BLOCK, COLORS, SMALL
 from chronoscene.kernels.compilation import inlined, inner, kernel
+from chronoscene.kernels.layers import add_column_sums, keep_active, sum_parts
 from chronoscene.kernels.matmul import product
 from chronoscene.kernels.memory import (
     load,
@@ -36,7 +37,7 @@ from chronoscene.kernels.memory import (
 )
 from chronoscene.kernels.thread_pool import draw, finish, wait_for
 from chronoscene.kernels.vector_math import lane_sum
-from chronoscene.kernels.vectors import LANES, absolute, select, splat
+from chronoscene.kernels.vectors import LANES, absolute, splat
 
 SLICE = 1024  # Gradients summed over the parts in one job; multiple of LANES
 
@@ -81,24 +82,6 @@ def _gather_gradient(layout, grads, n, unit, work, slot):  # type: ignore[no-unt
 
 
 @inner
-def _add_columns(memory, width, sums):  # type: ignore[no-untyped-def]
-    """Add the rows of a block to the gradient of a bias."""
-    for c in range(0, width, LANES):
-        total = load(sums, c)
-        for i in range(BLOCK):
-            total = total + load(memory, i * width + c)
-        store(sums, c, total)
-
-
-@inner
-def _keep_active(values, grads, count):  # type: ignore[no-untyped-def]
-    """Gradients of a ReLU: 0 where it gave 0."""
-    for i in range(0, count, LANES):
-        zero = splat(ZERO)
-        store(grads, i, select(zero < load(values, i), load(grads, i), zero))
-
-
-@inner
 def _layer_gradients(layout, weights, work, partial):  # type: ignore[no-untyped-def]
     """From the outputs of a block to its features, and to the weights on the way."""
     width, hiddens, small = layout.width_pad, layout.hiddens, layout.small
@@ -107,27 +90,27 @@ def _layer_gradients(layout, weights, work, partial):  # type: ignore[no-untyped
 
     d_weight = (partial.small, 0, small)
     product((work.small, 0, 1, SMALL), hidden, d_weight, d_weight, SMALL, small, BLOCK)
-    _add_columns(work.small, SMALL, partial.small_bias)
+    add_column_sums(work.small, 0, BLOCK, SMALL, partial.small_bias, 0)
     weight = (weights.small, 0, small)
     product((work.small, 0, SMALL, 1), weight, zeros, d_hidden, BLOCK, small, SMALL)
     if layout.color:
         d_weight, right = (partial.color, 0, width), (work.hidden, small, hiddens)
         product((work.colors, 0, 1, COLORS), right, d_weight, d_weight, COLORS, width, BLOCK)
-        _add_columns(work.colors, COLORS, partial.color_bias)
+        add_column_sums(work.colors, 0, BLOCK, COLORS, partial.color_bias, 0)
         weight, out = (weights.color, 0, width), (work.d_hidden, small, hiddens)
         product((work.colors, 0, COLORS, 1), weight, zeros, out, BLOCK, width, COLORS)
-    _keep_active(work.hidden, work.d_hidden, BLOCK * hiddens)
+    keep_active(work.hidden, 0, work.d_hidden, BLOCK * hiddens)
 
     d_weight = (partial.hidden_t, 0, hiddens)
     product((work.trunk, 0, 1, width), d_hidden, d_weight, d_weight, width, hiddens, BLOCK)
-    _add_columns(work.d_hidden, hiddens, partial.hidden_bias)
+    add_column_sums(work.d_hidden, 0, BLOCK, hiddens, partial.hidden_bias, 0)
     d_trunk, weight = (work.d_trunk, 0, width), (weights.hidden, 0, width)
     product((work.d_hidden, 0, hiddens, 1), weight, zeros, d_trunk, BLOCK, width, hiddens)
-    _keep_active(work.trunk, work.d_trunk, BLOCK * width)
+    keep_active(work.trunk, 0, work.d_trunk, BLOCK * width)
 
     d_weight, columns = (partial.trunk_t, 0, width), layout.features_pad
     product((work.x, 0, 1, columns), d_trunk, d_weight, d_weight, columns, width, BLOCK)
-    _add_columns(work.d_trunk, width, partial.trunk_bias)
+    add_column_sums(work.d_trunk, 0, BLOCK, width, partial.trunk_bias, 0)
     weight = (weights.trunk, 0, columns)
     product(
         (work.d_trunk, 0, width, 1), weight, zeros, (work.d_x, 0, columns), BLOCK, columns, width
@@ -308,9 +291,5 @@ def deform_backward(  # type: ignore[no-untyped-def]
     begin = SLICE * draw(control, 1)
     while begin < partial_size:
         end = min(begin + SLICE, partial_size)
-        for j in range(begin, end, LANES):
-            total = load_first(partial.planes, j, end - j)
-            for part in range(1, parts):
-                total = total + load_first(partial.planes, part * partial_size + j, end - j)
-            store_first(partial.planes, j, total, end - j)
+        sum_parts(partial.planes, parts, partial_size, begin, end)
         begin = SLICE * draw(control, 1)

@@ -19,6 +19,7 @@ from chronoscene.anchors.decode.forward import (
 from chronoscene.anchors.decode.layout import BLOCK, CHUNK, CYCLE
 from chronoscene.anchors.decode.second_layers import add_biases, add_offset
 from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.kernels.layers import add_column_sums, keep_active, sum_parts
 from chronoscene.kernels.matmul import product
 from chronoscene.kernels.memory import (
     load,
@@ -34,7 +35,7 @@ from chronoscene.kernels.memory import (
     write_index,
 )
 from chronoscene.kernels.vector_math import quad_spread, quad_sum
-from chronoscene.kernels.vectors import LANES, select, splat
+from chronoscene.kernels.vectors import LANES, splat
 
 SLICE = 1024  # Gradients of weights summed over the chunks by one task
 ZERO = float32(0)
@@ -141,17 +142,11 @@ def _output_layer_gradient(layout, weights, work, rows, partial):  # type: ignor
 def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: ignore[no-untyped-def]
     """Go back from hidden units to features and to the first layers."""
     hiddens, inputs, columns = layout.hiddens, layout.inputs_pad, layout.features_pad
-    zero, rows = splat(ZERO), tiled(count)
-    for i in range(0, count * hiddens, LANES):
-        grad = select(zero < load(work.hidden, i), load(work.d_hidden, i), zero)
-        store(work.d_hidden, i, grad)
+    rows = tiled(count)
+    keep_active(work.hidden, 0, work.d_hidden, count * hiddens)
     for i in range(count * hiddens, rows * hiddens, LANES):
-        store(work.d_hidden, i, zero)
-    for c in range(0, hiddens, LANES):
-        total = load(partial.b1, c)
-        for i in range(count):
-            total = total + load(work.d_hidden, i * hiddens + c)
-        store(partial.b1, c, total)
+        store(work.d_hidden, i, splat(ZERO))
+    add_column_sums(work.d_hidden, 0, count, hiddens, partial.b1, 0)
     d_hidden = (work.d_hidden, 0, hiddens)
     d_w1 = (partial.w1_t, 0, hiddens)
     product((work.x, 0, 1, inputs), d_hidden, d_w1, d_w1, tiled(layout.inputs), hiddens, count)
@@ -246,8 +241,4 @@ def decode_backward(  # type: ignore[no-untyped-def]
             set_zero(part.w1_t, 0, size)
             _chunk_gradient(layout, weights, source, outputs, grads, begin, end, own, part, out)
     for i in prange((size + SLICE - 1) // SLICE):
-        for j in range(i * SLICE, min((i + 1) * SLICE, size), LANES):
-            total = load_first(partial.w1_t, j, size - j)
-            for chunk in range(1, chunks):
-                total = total + load_first(partial.w1_t, chunk * size + j, size - j)
-            store_first(partial.w1_t, j, total, size - j)
+        sum_parts(partial.w1_t, chunks, size, i * SLICE, min((i + 1) * SLICE, size))
