@@ -12,18 +12,18 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
+
+from benchmarks.checkout_process import CheckoutProcess
 
 PACKAGE = Path(__file__).resolve().parents[2] / "chronoscene"
 CPU = "rasterizer/cpu/"
@@ -129,38 +129,15 @@ def copy_of_package(variant: Variant, folder: Path) -> None:
         (target / name).write_text(text, encoding="utf-8")
 
 
-class Process:
+class Process(CheckoutProcess):
     """Process that renders with one variant on request."""
 
     def __init__(self, variant: Variant, folder: Path, options: argparse.Namespace) -> None:
-        self.variant = variant
         copy_of_package(variant, folder)
         self.result = folder / "result.npz"
-        paths = [str(folder), str(PACKAGE.parent)]
-        arguments = [options.gaussians, options.width, options.threads, self.result]
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", __file__, "--worker", *map(str, arguments)],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    def ask(self, word: str) -> Any:
-        """Send a word and wait for the answer."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(word + "\n")
-        self._process.stdin.flush()
-        line = self._process.stdout.readline()
-        if not line:
-            raise SystemExit(f"{self.variant.name}: the process ended; see above")
-        return json.loads(line)
-
-    def close(self) -> None:
-        """End the process."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
+        given = [options.gaussians, options.width, options.threads, self.result]
+        arguments = [__file__, "--worker", *map(str, given)]
+        super().__init__(variant.name, arguments, [folder, PACKAGE.parent])
 
 
 def work(arguments: Sequence[str], inputs: IO[str]) -> None:
@@ -216,7 +193,6 @@ def compare(options: argparse.Namespace) -> None:
         for i, process in enumerate(others):
             image, both = np.median(ratios[:, i], axis=0)
             db, largest, centre = errors(process.result, exact.result)
-            name = process.variant.name
             cells = (
                 f"{image:.2f}x",
                 f"{both:.2f}x",
@@ -224,7 +200,7 @@ def compare(options: argparse.Namespace) -> None:
                 f"{largest:.1e}",
                 f"{centre:.1e}",
             )
-            print(f"{name:<22}" + "".join(f"{cell:>12}" for cell in cells))
+            print(f"{process.name:<22}" + "".join(f"{cell:>12}" for cell in cells))
         base = np.median(rounds[:, 0], axis=0)
         print(f"as it is: image {base[0]:.1f} ms, with gradients {base[1]:.1f} ms (medians)")
         for process in processes:

@@ -14,13 +14,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from benchmarks.checkout_process import CheckoutProcess
 from benchmarks.training.scaling import METHODS
 
 ROUND = 5
@@ -51,7 +49,7 @@ else:
     method = make(training_set(asked["points"], *asked["size"]), asked["method"], "balanced")
     numbers = iter(range(100, 1 << 40))
     advance = lambda: method.step(next(numbers), PROGRESS)
-print("ready", flush=True)
+print(json.dumps("ready"), flush=True)
 for line in sys.stdin:
     found = []
     for _ in range(int(line)):
@@ -62,49 +60,16 @@ for line in sys.stdin:
 """
 
 
-class Version:
-    """A process that trains with the code of one checkout."""
-
-    def __init__(self, folder: Path, asked: dict[str, Any]) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(folder.resolve())}
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _WORKER],
-            cwd=folder,
-            env=environment,
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-        self._write(json.dumps(asked))
-        self._read()
-
-    def steps(self, count: int) -> list[tuple[float, float]]:
-        """Do some steps: seconds of processor and wall time of each."""
-        self._write(str(count))
-        return [(float(a), float(b)) for a, b in json.loads(self._read())]
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.communicate()
-
-    def _write(self, line: str) -> None:
-        assert self._process.stdin
-        print(line, file=self._process.stdin, flush=True)
-
-    def _read(self) -> str:
-        assert self._process.stdout
-        if not (line := self._process.stdout.readline()):
-            raise SystemExit("a version ended early; its message is above")
-        return line
-
-
 def compare(folders: tuple[Path, Path], asked: dict[str, Any], steps: int) -> None:
     """Time both versions and print a line of the table."""
-    versions = [Version(folder, asked) for folder in folders]
+    versions = []
+    for folder in folders:
+        versions.append(CheckoutProcess(str(folder), ["-c", _WORKER], [folder]))
+        versions[-1].ask(json.dumps(asked))
     times: list[list[tuple[float, float]]] = [[], []]
     for turn in range(-(-steps // ROUND) + 1):
         for version, found in zip(versions, times, strict=True):
-            some = version.steps(ROUND)
+            some = version.ask(str(ROUND))
             found += some if turn else []  # the first compiles and touches memory
     for version in versions:
         version.close()
