@@ -24,7 +24,6 @@ from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import Registered
-from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 PSEUDO = ("first", "second")
@@ -121,7 +120,7 @@ def _compare(
 def _print_first(model: Registered, poses: NDArray[np.float64], first: NDArray[np.bool_]) -> None:
     """Print the error of the first period by itself, a lower bound for the other periods."""
     rotation, centre = pose_errors(model.cam_from_world, poses, first)
-    extent = float(np.linalg.norm(np.ptp(camera_centre(poses[first]), axis=0)))
+    extent = shared.true_extent(poses[first])
     print(
         f"  first period by itself: rotation {np.median(rotation[first]):.4f} degrees, centre "
         f"{100 * np.median(centre[first]) / extent:.4f} % of its extent"

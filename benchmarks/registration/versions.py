@@ -29,7 +29,6 @@ from benchmarks.registration.photos import read_periods, write_table
 from chronoscene.arrays import Array
 from chronoscene.formats import read_scene
 from chronoscene.harness.files.provenance import code_version, processor_name
-from chronoscene.scene.geometry import camera_centre
 
 HERE = Path(__file__).parents[2]
 COMMAND = "from chronoscene.cli import main; main()"
@@ -87,7 +86,7 @@ def errors(found: Registration, truth: dict[str, Array]) -> str:
         return "-"
     poses, true = (np.stack([p[name] for name in names]) for p in (found.poses, truth))
     rotation, centre = pose_errors(poses, true, first)
-    extent = float(np.linalg.norm(np.ptp(camera_centre(true), axis=0)))
+    extent = shared.true_extent(true)
     turned, moved = np.median(rotation[~first]), 100 * np.median(centre[~first]) / extent
     return f"{turned:.3f}°, {moved:.3f} %"
 
