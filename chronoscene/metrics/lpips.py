@@ -31,11 +31,10 @@ MIN_SIZE = 16  # Pixels per axis that survive the four poolings of VGG16
 class Lpips:
     """The metric with its weights in memory. No gradients."""
 
-    def __init__(self, weights: LpipsWeights, *, device: str = "cpu") -> None:
-        self.backbone = {name: t.to(device) for name, t in weights.backbone.items()}
-        self.heads = tuple(head.to(device) for head in weights.heads)
-        self.shift = torch.tensor(SHIFT, device=device).reshape(1, 3, 1, 1)
-        self.scale = torch.tensor(SCALE, device=device).reshape(1, 3, 1, 1)
+    def __init__(self, weights: LpipsWeights) -> None:
+        self.backbone, self.heads = weights.backbone, weights.heads
+        self.shift = torch.tensor(SHIFT).reshape(1, 3, 1, 1)
+        self.scale = torch.tensor(SCALE).reshape(1, 3, 1, 1)
 
     def features(self, image: Tensor) -> list[Tensor]:
         """Activations relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3. [1, 3, H, W] -> 5 maps"""
@@ -88,8 +87,7 @@ class Lpips:
                 found=str(list(array.shape)),
                 todo="use another metric, or evaluate larger images",
             )
-        tensor = torch.from_numpy(array).float().permute(2, 0, 1)[None]
-        return tensor.to(self.shift.device)
+        return torch.from_numpy(array).float().permute(2, 0, 1)[None]
 
 
 def _share(mask: ArrayLike | None) -> float:
@@ -102,13 +100,11 @@ def unit_length(feature: Tensor) -> Tensor:
     return feature / (length + EPSILON)
 
 
-def lpips_metrics(
-    weights: Path | None = None, *, device: str = "cpu"
-) -> dict[str, Callable[..., float]]:
+def lpips_metrics(weights: Path | None = None) -> dict[str, Callable[..., float]]:
     """Both variants by metric name.
 
     Raises:
         MetricUnavailableError: If the weights are not on this machine; says what to put where.
     """
-    metric = Lpips(load_weights(weights), device=device)
+    metric = Lpips(load_weights(weights))
     return {"lpips_vgg": metric.vgg, "lpips_vgg_3dgs": metric.vgg_3dgs}
