@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,9 +17,6 @@ from chronoscene.methods import StepReport, TrainingSet, TrainingView
 
 _RESERVOIR = 1_002  # Numbers of random draws, after the seed
 _FRESH = 1_003
-
-LoadImage = Callable[[int], NDArray[np.uint8]]
-LoadMask = Callable[[int], NDArray[np.bool_] | None]
 
 
 @dataclass

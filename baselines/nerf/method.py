@@ -12,7 +12,7 @@ from torch import Tensor
 
 from baselines.nerf.config import NerfConfig
 from baselines.nerf.network import ContentNetwork, NerfNetwork
-from baselines.nerf.time import FIRST_WIDTH, step_code, wave_code
+from baselines.nerf.time import FIRST_WIDTH, step_code
 from chronoscene.fields.method import Drawn, FieldMethod
 from chronoscene.fields.mlp import equal_groups, initial_layers, mlp
 from chronoscene.fields.network import Codes, FieldNetwork, frequency_code, named
@@ -71,7 +71,7 @@ class Nerf(FieldMethod):
         if self.config.time == "steps":
             return step_code(times, params["step_centres"], params["step_widths"])
         if self.config.time == "frequencies":
-            return wave_code(times, self.config.time_frequencies)
+            return frequency_code(times[:, None], self.config.time_frequencies)
         return torch.zeros(len(times), 0, device=times.device)
 
     def times(self, periods: Tensor) -> Tensor:

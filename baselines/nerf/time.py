@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from chronoscene.fields.network import frequency_code
-
 LEAST_WIDTH = 1e-3
 FIRST_WIDTH = 0.3
 
@@ -33,8 +31,3 @@ def step_code(t: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
     above = 1 - torch.exp(-away.clamp_min(0) / width) / 2
     smooth = torch.where(away < 0, below, above)
     return (away >= 0).to(smooth) + (smooth - smooth.detach())
-
-
-def wave_code(t: Tensor, count: int) -> Tensor:
-    """Time with its sines and cosines. [R] -> [R, 1 + 2 count]"""
-    return frequency_code(t[:, None], count)

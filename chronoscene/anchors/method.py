@@ -76,12 +76,6 @@ class AnchorMethod(SplattingMethod):
         """
         return with_new_periods(table, count)
 
-    def restored_tensors(
-        self, stored: dict[str, Tensor], layout: AnchorLayout
-    ) -> dict[str, Tensor]:
-        """Unpack what `stored_tensors` packed."""
-        return unpack_blocks(unpack_offsets(stored, layout.offsets), layout.num_periods)
-
     @property
     def model(self) -> AnchorModel:
         """Tensors, up to date; there are none before `setup` or `load`."""
@@ -207,7 +201,8 @@ class AnchorMethod(SplattingMethod):
         layout = AnchorLayout.from_meta(self.meta["layout"])
         self.config = dataclasses.replace(self.config, near_plane=layout.near_plane)
         try:
-            restored = self.restored_tensors(tensors, layout)
+            unpacked = unpack_offsets(tensors, layout.offsets)
+            restored = unpack_blocks(unpacked, layout.num_periods)
             self._model = self.model_class.from_tensors(layout, restored)
         except KeyError as error:
             raise CheckpointError(

@@ -21,6 +21,7 @@ from chronoscene.fields.marching import march
 from chronoscene.fields.rays import PixelPool
 from chronoscene.methods import TrainingSet
 from chronoscene.training import devices
+from chronoscene.training.periods import with_new_periods
 
 Density = Callable[[Tensor, int], Tensor]
 """Function that gives densities at contracted places [N, 3] in a period. [N]"""
@@ -88,9 +89,8 @@ class Occupancy:
 
     def extend(self, num_periods: int) -> None:
         """Add periods, which begin like the last one."""
-        last = [min(i, len(self.grids[0]) - 1) for i in range(num_periods)]
-        self.densities = tuple(grid[last] for grid in self.densities)
-        self.grids = tuple(grid[last] for grid in self.grids)
+        self.densities = tuple(with_new_periods(grid, num_periods) for grid in self.densities)
+        self.grids = tuple(with_new_periods(grid, num_periods) for grid in self.grids)
 
     def refresh(self, index: int, density: Density, generator: np.random.Generator) -> None:
         """Look at some cells again, in every period, and say anew which are occupied.
