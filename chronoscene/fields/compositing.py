@@ -22,7 +22,7 @@ from chronoscene.training import devices
 
 STOP = 1e-4
 """Transmittance below which nothing more is seen, as in Instant-NGP."""
-_LIMIT = 15.0  # Of the exponent that gives a density; the gradient is cut off beyond
+_LIMIT = 15.0  # Of the exponent that gives a density
 _ONE, _ZERO = float32(1), float32(0)
 _BLOCK = 64  # Rays per task
 
@@ -219,22 +219,6 @@ def _count_visible(densities, lengths, before, starts, counts):  # type: ignore[
             counts[ray + 1] = end - starts[ray]
 
 
-class _TruncatedExp(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        # NumPy makes one pass, where torch may take another path at the end of a thread's share.
-        clipped = x.detach().clamp(max=_LIMIT).contiguous()
-        kernels = devices.has_kernels(x)
-        out = torch.from_numpy(np.exp(clipped.numpy())) if kernels else clipped.exp()
-        ctx.save_for_backward(out)
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        (slope,) = ctx.saved_tensors
-        return grads[0] * slope
-
-
 class _Softplus(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -257,4 +241,4 @@ def softplus(x: Tensor) -> Tensor:
 
 def truncated_exp(x: Tensor) -> Tensor:
     """Density of a network's output: exp, cut off above, where its gradient stays finite."""
-    return _TruncatedExp.apply(x)
+    return devices.capped_exp(x, _LIMIT)

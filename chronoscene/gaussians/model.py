@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from chronoscene.methods import TrainingSet, View
-from chronoscene.training.devices import exp
+from chronoscene.training.devices import capped_exp, exp
 from chronoscene.training.drawing import Splats, camera_centre_tensor
 from chronoscene.training.points import finite_rows, rms_spacing
 from chronoscene.training.spherical_harmonics import NUM_BASES, dc_from_rgb, evaluate
@@ -27,7 +27,9 @@ SHAPES: dict[str, tuple[int, ...]] = {
 }
 """Groups of parameters: name to the shape of one row."""
 
-_MAX_EXPONENT = 88.0  # Its exponential is finite in float32
+_MAX_EXPONENT = 88.0
+"""Logarithm of the largest scale. An infinite one would turn the gradient of a Gaussian that is not
+drawn, 0, into nan, and with it that of the whole step."""
 MIN_SPACING = math.sqrt(1e-7)
 """Smallest initial scale, in training units, however close the points are."""
 
@@ -107,27 +109,8 @@ def logit(probability: float) -> float:
     return float(np.log(probability / (1 - probability)))
 
 
-class _Exp(torch.autograd.Function):
-    """``torch.exp`` whose bits do not depend on how its rows are shared among threads.
-
-    It ends at the largest numbers of float32. An infinite scale would turn the gradient of a
-    Gaussian that is not drawn, 0, into nan, and with it that of the whole step.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = exp(x.detach().clamp(max=_MAX_EXPONENT))
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        (y,) = ctx.saved_tensors
-        return grads[0] * y
-
-
 class _Sigmoid(torch.autograd.Function):
-    """``torch.sigmoid`` whose bits do not depend on threads either."""
+    """``torch.sigmoid`` whose bits do not depend on how its rows are shared among threads."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -144,7 +127,7 @@ class _Sigmoid(torch.autograd.Function):
 
 def scales_of(log_scales: Tensor) -> Tensor:
     """Standard deviations in units of the training frame, finite where logarithms are. [N, 3]"""
-    return _Exp.apply(log_scales)
+    return capped_exp(log_scales, _MAX_EXPONENT)
 
 
 def opacities_of(logit_opacities: Tensor) -> Tensor:

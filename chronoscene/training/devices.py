@@ -6,6 +6,8 @@ the answer of, makes the host wait until a GPU has done all that it was asked fo
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -68,3 +70,24 @@ def exp(x: Tensor) -> Tensor:
         return x.exp()
     with np.errstate(over="ignore"):
         return torch.from_numpy(np.exp(x.contiguous().numpy()))
+
+
+class _CappedExp(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, limit: float) -> Tensor:
+        y = exp(x.detach().clamp(max=limit))
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        (y,) = ctx.saved_tensors
+        return grads[0] * y, None
+
+
+def capped_exp(x: Tensor, limit: float) -> Tensor:
+    """Compute ``exp`` up to a limit of the exponent, beyond which value and slope stay as there.
+
+    Differentiable; bits are those of `exp`.
+    """
+    return _CappedExp.apply(x, limit)
