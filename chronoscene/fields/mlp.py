@@ -13,7 +13,7 @@ from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.fields.mlp_kernels import Layers, mlp_backward, mlp_forward
-from chronoscene.kernels.matmul import PADDING
+from chronoscene.kernels.matmul import padded
 from chronoscene.training import devices
 
 Activation = Literal["none", "sigmoid"]
@@ -93,15 +93,11 @@ def initial_layers(widths: Sequence[int], generator: torch.Generator) -> list[Te
     return layers
 
 
-def _padded(width: int) -> int:
-    return -(-width // PADDING) * PADDING
-
-
 def _describe(inputs: int, shared: int, layers: Sequence[Tensor], sigmoid: bool) -> Layers:
     """Place all weights in one array: matrices, biases, and last the transposes."""
     depth = len(layers) // 2
-    widths = [_padded(inputs), *(_padded(len(m)) for m in layers[::2])]
-    shared_pad = _padded(shared)
+    widths = [padded(inputs), *(padded(len(m)) for m in layers[::2])]
+    shared_pad = padded(shared)
     sizes = [a * b for a, b in pairwise(widths)] + [shared_pad * widths[1]]
     ends = np.cumsum([*sizes, *widths[1:], *sizes])
     places = np.concatenate(([0], ends[:-1])).astype(np.int64)

@@ -34,6 +34,11 @@ ROW_TILE = 8 if MANY_REGISTERS else 4
 PADDING = max(ROW_TILE, LANES)
 
 
+def padded(count: int) -> int:
+    """Round a length up to a multiple of `PADDING`."""
+    return -(-count // PADDING) * PADDING
+
+
 class _Matrix:
     """Addresses in a matrix while code is generated."""
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from math import prod
 from typing import NamedTuple
 
-from chronoscene.kernels.matmul import PADDING
+from chronoscene.kernels.matmul import padded
 from chronoscene.kernels.vectors import LANES
 from chronoscene.training.spherical_harmonics import NUM_BASES
 
@@ -103,10 +103,6 @@ class Layout(NamedTuple):
 
 def make_layout(field: Field) -> Layout:
     """Derive all sizes."""
-
-    def padded(count: int) -> int:
-        return -(-count // PADDING) * PADDING
-
     features, width_pad = len(field.sizes) * field.channels, padded(field.width)
     color = "sh" in field.heads
     hiddens = len(field.heads) * width_pad

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from chronoscene.kernels.matmul import PADDING
+from chronoscene.kernels.matmul import padded
 from chronoscene.kernels.vectors import LANES
 
 BLOCK = 64
@@ -56,10 +56,6 @@ class Layout(NamedTuple):
 
 def make_layout(*, base: int, period: int, shared: int, hidden: int, offsets: int) -> Layout:
     """Derive all sizes."""
-
-    def padded(count: int) -> int:
-        return -(-count // PADDING) * PADDING
-
     scales_at = padded(offsets)
     quats_at = scales_at + padded(3 * offsets)
     colors_at = quats_at + padded(4 * offsets)
