@@ -86,7 +86,7 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         rays, channels = len(groups.starts) - 1, values.shape[1]
         sums, clear = torch.zeros(rays, channels), torch.ones(rays)
-        given = [t.detach().contiguous().numpy() for t in (densities, values, lengths)]
+        given = [devices.array_of(t) for t in (densities, values, lengths)]
         starts = groups.starts.numpy()
         _composite_forward(*given, starts, np.arange(rays), sums.numpy(), clear.numpy())
         ctx.kept = *given, starts
@@ -96,7 +96,7 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         densities, values, lengths, starts = ctx.kept
         d_densities, d_values = np.zeros_like(densities), np.zeros_like(values)
-        given = [g.contiguous().numpy() for g in grads]
+        given = map(devices.array_of, grads)
         _composite_backward(densities, values, lengths, starts, *given, d_densities, d_values)
         return torch.from_numpy(d_densities), torch.from_numpy(d_values), None, None
 
@@ -170,7 +170,7 @@ class Front:
         if self.sums.shape[1] == 0:
             self.sums = values.new_zeros(len(self.clear), values.shape[1])
         if devices.has_kernels(densities, values, lengths):
-            given = [t.contiguous().numpy() for t in (densities, values, lengths, groups.starts)]
+            given = map(devices.array_of, (densities, values, lengths, groups.starts))
             _composite_forward(*given, rays.numpy(), self.sums.numpy(), self.clear.numpy())
             return
         found = composite_reference(densities, values, lengths, groups, self.clear[rays])
@@ -199,7 +199,7 @@ def visible(
         before = torch.cat((groups.starts[:1], kept.cumsum(0)))
         return Groups(before.index_select(0, groups.starts), of_row)
     clear = densities.new_ones(len(groups.starts) - 1) if clear is None else clear
-    given = [t.detach().contiguous().numpy() for t in (densities, lengths, clear)]
+    given = map(devices.array_of, (densities, lengths, clear))
     starts = groups.starts.numpy()
     counts = np.zeros(len(starts), np.int64)
     _count_visible(*given, starts, counts)

@@ -104,19 +104,19 @@ class _Encode(torch.autograd.Function):
     def forward(ctx: Any, table: Tensor, places: Tensor, layout: GridLayout) -> Tensor:
         out = torch.empty(len(places), layout.width)
         levels = layout.resolutions, layout.starts, layout.dense
-        flat = table.detach().contiguous().view(-1).numpy()
         given = _padded(places.numpy()), len(places)
-        encode_forward(*given, flat, *levels, numba.get_num_threads(), out.view(-1).numpy())
+        threads = numba.get_num_threads()
+        encode_forward(*given, devices.flat(table), *levels, threads, devices.flat(out))
         ctx.given, ctx.levels = given, levels
         return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         out = torch.zeros(int(ctx.levels[1][-1]), FEATURES)
-        given = grads[0].contiguous().view(-1).numpy()
+        given = devices.flat(grads[0])
         by_level = np.empty(len(given) + 2 * LANES, np.float32)
         by_level[len(given) :] = 0  # read beside the last gradients, where a nan would hide them
-        rest = numba.get_num_threads(), by_level, out.view(-1).numpy()
+        rest = numba.get_num_threads(), by_level, devices.flat(out)
         encode_backward(*ctx.given, given, *ctx.levels, *rest)
         return out, None, None
 

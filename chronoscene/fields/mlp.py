@@ -175,10 +175,10 @@ class _Mlp(torch.autograd.Function):
         about = _describe(x.shape[1], shared.shape[1], layers, output == "sigmoid")
         starts = groups.starts.numpy()
         places = starts, groups.of_row.numpy(), _chunks(starts, about.size)
-        fixed = about, _pack(about, layers), _flat(x), _flat(shared), *places
+        fixed = about, _pack(about, layers), devices.flat(x), devices.flat(shared), *places
         out = torch.empty(len(x), about.outputs)
-        mlp_forward(*fixed, _flat(out))
-        ctx.kept = (*fixed, _flat(out)), layers, (x.shape, shared.shape)
+        mlp_forward(*fixed, devices.flat(out))
+        ctx.kept = (*fixed, devices.flat(out)), layers, (x.shape, shared.shape)
         return out
 
     @staticmethod
@@ -186,12 +186,6 @@ class _Mlp(torch.autograd.Function):
         (about, *fixed), layers, (x, shared) = ctx.kept
         d_x, d_shared = torch.zeros(x), torch.empty(shared)
         partial = np.zeros((len(fixed[5]) - 1, about.size), np.float32)
-        given = _flat(grads[0].contiguous())
-        mlp_backward(about, *fixed, given, partial, _flat(d_x), _flat(d_shared))
+        given = devices.flat(grads[0])
+        mlp_backward(about, *fixed, given, partial, devices.flat(d_x), devices.flat(d_shared))
         return d_x, d_shared, None, None, *_unpack(about, partial[0], layers)
-
-
-def _flat(tensor: Tensor) -> NDArray[np.float32]:
-    """Flat array of the numbers of a tensor, which share its memory if it is contiguous."""
-    found: NDArray[np.float32] = tensor.detach().contiguous().view(-1).numpy()
-    return found

@@ -36,7 +36,7 @@ class _PartRows(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, first: NDArray[np.int64], starts: NDArray[np.int64]) -> Tensor:
         ctx.kept = x.shape, first, starts
         out, width = x.new_empty(int(starts[-1]), *x.shape[1:]), x[:1].numel()
-        _copy(_flat(x), first, _flat(out), starts[:-1], np.diff(starts), width)
+        _copy(devices.flat(x), first, devices.flat(out), starts[:-1], np.diff(starts), width)
         return out
 
     @staticmethod
@@ -44,13 +44,8 @@ class _PartRows(torch.autograd.Function):
         shape, first, starts = ctx.kept
         out = grads[0].new_zeros(shape)
         width = out[:1].numel()
-        _copy(_flat(grads[0]), starts[:-1], _flat(out), first, np.diff(starts), width)
+        _copy(devices.flat(grads[0]), starts[:-1], devices.flat(out), first, np.diff(starts), width)
         return out, None, None
-
-
-def _flat(x: Tensor) -> NDArray[np.float32]:
-    found: NDArray[np.float32] = x.detach().contiguous().view(-1).numpy()
-    return found
 
 
 @kernel(parallel=True)

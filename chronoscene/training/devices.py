@@ -34,6 +34,16 @@ def to_device(array: NDArray[np.generic], device: str | torch.device) -> Tensor:
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
+def array_of(tensor: Tensor) -> NDArray[Any]:
+    """Return the numbers of a tensor on a CPU as a contiguous array, its own if they are one."""
+    return tensor.detach().contiguous().numpy()
+
+
+def flat(tensor: Tensor) -> NDArray[Any]:
+    """Return `array_of` a tensor in one dimension."""
+    return array_of(tensor).reshape(-1)
+
+
 def uniform(generator: np.random.Generator, shape: tuple[int, ...], like: Tensor) -> Tensor:
     """Draw random numbers 0..1 on the device of a tensor. float32"""
     if like.is_cuda:

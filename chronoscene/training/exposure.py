@@ -166,12 +166,8 @@ def _mixed(image: Tensor, transform: Tensor) -> Tensor:
     if not devices.has_kernels(image):
         return image @ transform[:, :3].T + transform[:, 3]
     result = torch.empty_like(image, memory_format=torch.contiguous_format)
-    _mix_rows(_array(image), _array(transform), result.numpy())
+    _mix_rows(devices.array_of(image), devices.array_of(transform), result.numpy())
     return result
-
-
-def _array(tensor: Tensor) -> NDArray[Any]:
-    return tensor.detach().contiguous().numpy()
 
 
 def _moments(grad: Tensor, image: Tensor) -> Tensor:
@@ -180,7 +176,7 @@ def _moments(grad: Tensor, image: Tensor) -> Tensor:
         products = torch.einsum("hwi,hwj->ij", grad, image)
         return torch.cat([products, grad.sum((0, 1))[:, None]], dim=1)
     sums = np.zeros((len(grad), 3, 4))
-    _row_moments(_array(grad), _array(image), sums)
+    _row_moments(devices.array_of(grad), devices.array_of(image), sums)
     return torch.from_numpy(sums.sum(axis=0)).to(grad)
 
 

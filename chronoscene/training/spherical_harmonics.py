@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import torch
 from numba import prange
-from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.kernels.compilation import inner, kernel
@@ -121,7 +120,7 @@ class _Evaluate(torch.autograd.Function):
         ctx: Any, sh_dc: Tensor, sh_rest: Tensor, means: Tensor, centre: Tensor, degree: int
     ) -> Tensor:
         result = torch.empty(len(means), 3)
-        inputs = (_array(tensor) for tensor in (sh_dc, sh_rest, means, centre))
+        inputs = (devices.array_of(tensor) for tensor in (sh_dc, sh_rest, means, centre))
         _forward(*inputs, degree, result.numpy())
         ctx.save_for_backward(sh_dc, sh_rest, means, centre, result)
         ctx.degree = degree
@@ -129,14 +128,10 @@ class _Evaluate(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        dc, rest, means, centre, colors = (_array(tensor) for tensor in ctx.saved_tensors)
+        dc, rest, means, centre, colors = (devices.array_of(tensor) for tensor in ctx.saved_tensors)
         results = [np.empty_like(array) for array in (dc, rest, means)]
-        _backward(rest, means, centre, ctx.degree, colors, _array(grads[0]), *results)
+        _backward(rest, means, centre, ctx.degree, colors, devices.array_of(grads[0]), *results)
         return *(torch.from_numpy(result) for result in results), None, None
-
-
-def _array(tensor: Tensor) -> NDArray[np.float32]:
-    return tensor.detach().contiguous().numpy()
 
 
 @inner(inline="always")
