@@ -27,7 +27,6 @@ from chronoscene.kernels.compilation import kernel
 from chronoscene.kernels.memory import emit_address, emit_load, emit_store
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.kernels.vectors import LANES, emit_multiply_add, emitted
-from chronoscene.rasterizer.constants import EPS2D, FAR_PLANE, NEAR_PLANE
 from chronoscene.rasterizer.cpu import layout
 from chronoscene.rasterizer.cpu.passes import Rendering
 from chronoscene.rasterizer.inputs import Inputs
@@ -107,20 +106,7 @@ class Stages:
         self.width, self.height = scene.width, scene.height
         self.gaussians: Any = tuple(x.detach().numpy().reshape(-1) for x in scene.gaussians)
         self.count = len(scene.gaussians[0])
-        inputs = Inputs(
-            *scene.gaussians,
-            scene.viewmats,
-            scene.Ks,
-            width=self.width,
-            height=self.height,
-            near_plane=NEAR_PLANE,
-            far_plane=FAR_PLANE,
-            eps2d=EPS2D,
-            backgrounds=None,
-            render_depth=False,
-            absgrad=False,
-            antialiased=False,
-        )
+        inputs = Inputs(*scene.gaussians, scene.viewmats, scene.Ks, self.width, self.height)
         pose, intrinsics = (x[0].double().numpy() for x in (scene.viewmats, scene.Ks))
         self.view = layout.make_view(pose, intrinsics, inputs)
         self.image_grad = scene.image_grad.numpy().reshape(-1)

@@ -18,7 +18,6 @@ from chronoscene.anchors.decode.function import Job
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.methods import TrainingView
 from chronoscene.rasterizer import RasterInfo
-from chronoscene.rasterizer.constants import EPS2D, FAR_PLANE
 from chronoscene.rasterizer.cpu import DirectRender
 from chronoscene.rasterizer.cpu.layout import LANES
 from chronoscene.rasterizer.inputs import Inputs, check_settings
@@ -112,10 +111,7 @@ def _raster_inputs(
         width=view.width,
         height=view.height,
         near_plane=config.near_plane,
-        far_plane=FAR_PLANE,
-        eps2d=EPS2D,
         backgrounds=background[None],
-        render_depth=False,
         absgrad=config.absgrad,
         antialiased=config.antialiased,
     )

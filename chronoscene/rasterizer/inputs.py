@@ -10,7 +10,15 @@ from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
-from chronoscene.rasterizer.constants import DEPTH_MAX, EXTENT_MAX, FOCAL_MIN, SIZE_MAX
+from chronoscene.rasterizer.constants import (
+    DEPTH_MAX,
+    EPS2D,
+    EXTENT_MAX,
+    FAR_PLANE,
+    FOCAL_MIN,
+    NEAR_PLANE,
+    SIZE_MAX,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,13 +34,13 @@ class Inputs:
     Ks: Tensor
     width: int
     height: int
-    near_plane: float
-    far_plane: float
-    eps2d: float
-    backgrounds: Tensor | None
-    render_depth: bool
-    absgrad: bool
-    antialiased: bool
+    near_plane: float = NEAR_PLANE
+    far_plane: float = FAR_PLANE
+    eps2d: float = EPS2D
+    backgrounds: Tensor | None = None
+    render_depth: bool = False
+    absgrad: bool = False
+    antialiased: bool = False
 
     @property
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -205,8 +205,6 @@ def filter_factors(
     K: Tensor,
     width: int,
     height: int,
-    *,
-    eps2d: float = EPS2D,
 ) -> Tensor:
     """Compute what the antialiasing filter multiplies opacities by in one view. [M]
 
@@ -214,7 +212,7 @@ def filter_factors(
     `chronoscene.rasterizer.rasterize`, for one camera.
     """
     projected = _project(means, quats, scales, viewmat, K, width, height)
-    return _compensations(projected.axes, eps2d)
+    return _compensations(projected.axes, EPS2D)
 
 
 def _visible(projected: _Projected, extents: Tensor, inputs: Inputs) -> Tensor:
