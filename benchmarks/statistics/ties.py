@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.markdown import table
 from chronoscene.harness.report.differences import margins, seed_spread
 from chronoscene.harness.report.intervals import (
     REPLICATES,
@@ -117,13 +118,10 @@ def coverage(cases: int, views: int, correlation: float) -> float:
     return 100 * float(np.mean((low <= 0) & (high >= 0)))
 
 
-def show(title: str, heads: Iterable[object], rows: Iterable[Sequence[object]]) -> None:
+def show(title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table in Markdown."""
-    names = [*map(str, heads)]
-    print(f"\n{title}\n\n| {' | '.join(names)} |\n|{' ---: |' * len(names)}")
-    for row in rows:
-        cells = (f"{cell:.0f} %" if isinstance(cell, float) else str(cell) for cell in row)
-        print(f"| {' | '.join(cells)} |")
+    texts = ([f"{c:.0f} %" if isinstance(c, float) else str(c) for c in row] for row in rows)
+    print(f"\n{title}\n\n{table(heads, texts)}", flush=True)
 
 
 def main() -> None:
