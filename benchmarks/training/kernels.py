@@ -17,7 +17,6 @@ import argparse
 import platform
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from itertools import cycle
 
 import torch
@@ -75,10 +74,6 @@ class Step:
         self.visible = torch.arange(anchors)
         self.used_offsets = torch.full((anchors,), -1)
         self.block_rows = own_blocks(anchors, PERIODS)
-
-    def run(self, function: Callable[..., object]) -> object:
-        """Decode everything."""
-        return function(self.inputs())
 
     def inputs(self) -> DecodeInputs:
         """Return the inputs of the decode."""
@@ -142,25 +137,20 @@ class TwoParts:
 
 def time_decode(step: Step, repeats: int, reference: bool) -> None:
     """Decode with gradients for the active offsets, and with them for all."""
-    whole = step.run(decode)
-    assert isinstance(whole, tuple)
-    active = whole[3].detach() > 0
+    whole = decode(step.inputs())
+    active = whole.opacities.detach() > 0
     g = torch.Generator().manual_seed(1)
     every = [torch.randn(value.shape, generator=g) for value in whole]
     some = [grad * active.reshape(-1, *[1] * (grad.ndim - 1)) for grad in every]
     few = [grad[active] for grad in every]
     share = f"{100 * float(active.float().mean()):.0f} %"
-
-    def active_only() -> Sequence[Tensor]:
-        return step.run(decode_active)[0]  # type: ignore[index]
-
     rows: list[tuple[str, Callable[[], Sequence[Tensor]], Sequence[Tensor]]] = [
-        (f"decode_active, {share} active", active_only, few),
-        (f"decode, gradients for {share}", partial(step.run, decode), some),  # type: ignore[list-item]
-        ("decode, gradients for all", partial(step.run, decode), every),  # type: ignore[list-item]
+        (f"decode_active, {share} active", lambda: decode_active(step.inputs())[0], few),
+        (f"decode, gradients for {share}", lambda: decode(step.inputs()), some),
+        ("decode, gradients for all", lambda: decode(step.inputs()), every),
     ]
     if reference:
-        rows.append(("decode in torch", partial(step.run, decode_reference), some))  # type: ignore[arg-type]
+        rows.append(("decode in torch", lambda: decode_reference(step.inputs()), some))
     for name, forward, grads in rows:
         parts = TwoParts(forward, grads, step.parameters())
         report(name, repeats, parts.forward, parts.backward)
