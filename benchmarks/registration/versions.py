@@ -52,7 +52,7 @@ def register(checkout: Path, captures: Path, table: Path | None, out: Path) -> R
     """Run the command of a checkout with features, matches and models of its own."""
     words = ["register", str(captures), str(out), "--threads", "1", "--overwrite", "--report"]
     words += [] if table is None else ["--table", str(table)]
-    before = os.times()
+    before = shared.cpu_seconds()
     done = subprocess.run(
         [sys.executable, "-P", "-c", COMMAND, *words],
         # Some versions start processes that import what is in the current folder first.
@@ -62,9 +62,7 @@ def register(checkout: Path, captures: Path, table: Path | None, out: Path) -> R
         text=True,
         check=False,
     )
-    after = os.times()
-    seconds = after.children_user + after.children_system
-    seconds -= before.children_user + before.children_system
+    seconds = shared.cpu_seconds() - before
     if done.returncode > 1 or not (out / "sparse").is_dir():
         print(f"  {out.name}: {done.stderr.strip().splitlines()[-1:]}", flush=True)
         return Registration(seconds, shared.REFUSED, {}, frozenset())
