@@ -7,8 +7,8 @@
 Makes JPEG photos of noise, every tenth with a mask, and trains 3DGS on them with few Gaussians. The
 photos do not fit into the memory that they may take, so the first pass decodes all of them and the
 others read them from disk; they are dropped from the memory of the operating system after each
-pass. Before, the same training runs on one photo that is at hand: what its steps take is what
-loading adds to. ``--step`` puts steps of so many milliseconds that need no processor in the place
+pass. Before, the same training runs on one photo that is in memory, which shows what its steps take
+without loading. ``--step`` puts steps of so many milliseconds that need no processor in the place
 of those of 3DGS, as if a GPU did them.
 
 Prints for each pass the seconds on the training clock and those waited, the processor time of this
@@ -101,7 +101,7 @@ def write_photo(root: Path, number: int, grain: np.ndarray) -> None:
 
 
 class Sleeper:
-    """A method that looks at its photos and leaves the rest to nobody."""
+    """A method that reads its photos and then sleeps instead of training."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds

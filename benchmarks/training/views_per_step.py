@@ -4,7 +4,7 @@
     python -m benchmarks.training.views_per_step --generated 20000 --size 320 240 --threads 1 2
 
 The first is of quality by computing time. Part of the training views are held back, and the PSNR is
-on these: the test views say nothing. The time is that of the processor, so other work on the
+on these; the test views are not used. The time is that of the processor, so other work on the
 machine does not count: one thread, and no time for what several would do at once.
 
 The second is of time alone, on so many generated points: milliseconds of a view, median and minimum

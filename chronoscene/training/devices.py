@@ -35,7 +35,7 @@ def to_device(array: NDArray[np.generic], device: str | torch.device) -> Tensor:
 
 
 def array_of(tensor: Tensor) -> NDArray[Any]:
-    """Return the numbers of a tensor on a CPU as a contiguous array, its own if they are one."""
+    """Return a tensor on a CPU as a contiguous array, which shares its memory where it can."""
     return tensor.detach().contiguous().numpy()
 
 
