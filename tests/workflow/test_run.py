@@ -176,16 +176,22 @@ def test_a_failed_alignment_is_not_trained_on(fake, monkeypatch):
     assert fake.states["bench"] == "failed"
 
 
-def test_the_memory_for_photos_changes_no_step(fake, monkeypatch):
-    """The training has it, and no record."""
-    asked = []
+def arguments_of_trainings(fake, monkeypatch, name):
+    """List to which every training, all of which fail, will add one of its arguments."""
+    given = []
 
-    def train(scene, method, *, photo_memory, **options):
-        asked.append(photo_memory)
+    def train(scene, method, **options):
+        given.append(options[name])
         raise RegistrationError("bench", expected="time", found="none", todo="wait")
 
     monkeypatch.setattr(steps, "bench", train)
     monkeypatch.setattr(fake, "bench", steps._bench, raising=False)
+    return given
+
+
+def test_the_memory_for_photos_changes_no_step(fake, monkeypatch):
+    """The training has it, and no record."""
+    asked = arguments_of_trainings(fake, monkeypatch, "photo_memory")
     for memory in (0.5, 1.5):
         call = [str(fake.captures), str(fake.out), "--photo-memory", str(memory)]
         with pytest.raises(RegistrationError):
@@ -194,14 +200,7 @@ def test_the_memory_for_photos_changes_no_step(fake, monkeypatch):
 
 
 def test_runs_in_one_folder_share_scene_and_width(fake, monkeypatch):
-    folders = []
-
-    def train(scene, method, *, out, **options):
-        folders.append(out)
-        raise RegistrationError("bench", expected="time", found="none", todo="wait")
-
-    monkeypatch.setattr(steps, "bench", train)
-    monkeypatch.setattr(fake, "bench", steps._bench, raising=False)
+    folders = arguments_of_trainings(fake, monkeypatch, "out")
     for poses, options in (
         ("first", {"budget": "1m"}),
         ("first", {"budget": "2m"}),
