@@ -195,7 +195,9 @@ def test_a_training_goes_on_with_as_many_views_to_a_step(tmp_path):
     first, second = (start("3dgs", data, views_per_step=n) for n in (2, 1))
     train(first, 0, 4)
     first.save_training(tmp_path)
-    with pytest.raises(CheckpointError, match=r"views_per_step: expected 2, found 1; go on with"):
+    with pytest.raises(
+        CheckpointError, match=r"views_per_step: expected 2, found 1; continue with"
+    ):
         second.load_training(tmp_path)
 
 
