@@ -92,7 +92,10 @@ def refuse_options(names: Iterable[str], condition: str) -> None:
     for name in names:
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise ConfigError(
-                flags[name], expected=f"none {condition}", found="one", todo="leave it out"
+                flags[name],
+                expected=f"no such option {condition}",
+                found="one",
+                todo="leave it out",
             )
 
 

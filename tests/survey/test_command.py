@@ -109,7 +109,7 @@ def test_a_scene_without_a_model_has_points_alone(tmp_path):
         again = survey(scene, "--out", tmp_path / "again", option, value)
         assert f"{option}: expected a finished run" in str(again.exception)
     again = survey(site, "--out", tmp_path / "again", "--device", "cpu")
-    assert "--device: expected none for a scene without a model" in str(again.exception)
+    assert "--device: expected no such option for a scene without a model" in str(again.exception)
 
 
 def test_distances_between_dense_sparse_points(tmp_path):

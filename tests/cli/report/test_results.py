@@ -213,8 +213,8 @@ def test_names_and_columns_can_be_chosen(tmp_path):
         (("--rename", "3DGS=4DGS"), "names that still differ afterwards"),
         (("--rename", "3DGS"), "--rename: expected OLD=NEW"),
         (("--columns", "macros"), "--columns: expected one of .*macro"),
-        (("--columns", "macro", "--format", "csv"), "--columns: expected none with csv"),
-        (("--rename", "3DGS=x", "--format", "json"), "--rename: expected none with json"),
+        (("--columns", "macro", "--format", "csv"), "--columns: expected no such option with csv"),
+        (("--rename", "3DGS=x", "--format", "json"), "--rename: expected no such option with json"),
     ],
 )
 def test_names_and_columns_that_are_not_there_are_refused(tmp_path, option, message):
@@ -302,7 +302,7 @@ def test_changes_are_told(score, tmp_path):
 
 def test_weights_that_no_metric_needs_are_refused(tmp_path):
     command = ["score", str(tmp_path), "--metric", "psnr,flip", "--lpips-weights", str(tmp_path)]
-    with pytest.raises(ConfigError, match="--lpips-weights: expected none without LPIPS"):
+    with pytest.raises(ConfigError, match="--lpips-weights: expected no such option without LPIPS"):
         CliRunner().invoke(cli, command, catch_exceptions=False)
 
 

@@ -89,7 +89,7 @@ def test_limits_give_one_sentence_and_nothing_else(runs):
 
 @pytest.mark.parametrize("option", [("--format", "csv"), ("--figures", "new")])
 def test_options_of_what_limits_leave_out_are_refused(runs, option):
-    with pytest.raises(ConfigError, match=f"{option[0]}: expected none with --budget"):
+    with pytest.raises(ConfigError, match=f"{option[0]}: expected no such option with --budget"):
         tradeoff(runs, "--budget", "1m", *option)
 
 

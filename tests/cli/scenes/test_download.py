@@ -81,9 +81,15 @@ def test_other_hosts_are_for_people():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["5pointz", "--out", "data"], "--out: expected none with 5pointz, which only people can"),
-        (["5pointz", "wall"], "scenes: expected none with 5pointz, which only people can"),
-        (["--out", "data"], "--out: expected none without NAME"),
+        (
+            ["5pointz", "--out", "data"],
+            "--out: expected no such option with 5pointz, which only people can",
+        ),
+        (
+            ["5pointz", "wall"],
+            "scenes: expected no such option with 5pointz, which only people can",
+        ),
+        (["--out", "data"], "--out: expected no such option without NAME"),
     ],
 )
 def test_arguments_without_effect_are_refused(arguments, message):

@@ -218,7 +218,7 @@ def test_options_without_an_effect_are_refused(
     (tmp_path / "given").touch()
     other = [] if given is None else [given, tmp_path / "given"]
     done = call(photos(tmp_path / "in/a", 3), tmp_path / "out", option, value, *other)
-    assert str(done.exception).startswith(f"{option}: expected none {condition}")
+    assert str(done.exception).startswith(f"{option}: expected no such option {condition}")
     assert not (tmp_path / "out.work").exists()
 
 
@@ -228,5 +228,5 @@ def test_mark_refuses_options_of_points_that_are_not_given(
 ) -> None:
     words = ["mark", photos(tmp_path / "in", 2), tmp_path / "page.html", option, value]
     done = CliRunner().invoke(main, list(map(str, words)))
-    assert str(done.exception).startswith(f"{option}: expected none without --tie-points")
+    assert str(done.exception).startswith(f"{option}: expected no such option without --tie-points")
     assert not (tmp_path / "page.html").exists()

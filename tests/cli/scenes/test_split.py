@@ -54,7 +54,7 @@ def test_the_list_makes_the_split_that_the_hash_names(scene, tmp_path):
 @pytest.mark.parametrize("option", [("--every", 8), ("--fraction", 0.125)])
 @pytest.mark.parametrize("strategy", [("periods", "--period", 1), ("none",)])
 def test_a_share_is_refused_where_it_has_no_effect(scene, tmp_path, option, strategy):
-    message = f"{option[0]}: expected none with --strategy {strategy[0]}"
+    message = f"{option[0]}: expected no such option with --strategy {strategy[0]}"
     with pytest.raises(ConfigError, match=message):
         run(scene, tmp_path / "t.txt", "--strategy", *strategy, *option)
 

@@ -208,7 +208,7 @@ def test_cameras_are_drawn_in_figures_only(make_scene_folder):
 def test_a_form_of_figures_that_nobody_asked_for_is_refused(make_scene_folder):
     error = run(make_scene_folder(), "--figure-format", "pdf").exception
     assert isinstance(error, ConfigError)
-    said = "--figure-format: expected none without --figures, found one; leave it out"
+    said = "--figure-format: expected no such option without --figures, found one; leave it out"
     assert str(error) == said
 
 

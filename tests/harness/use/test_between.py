@@ -126,10 +126,10 @@ def test_a_run_without_its_model(runs, scene):
 
 @pytest.mark.parametrize("option", [("--views", 2), ("--metric", "psnr"), ("--html", "x.html")])
 def test_options_without_effect_are_refused(runs, option):
-    with pytest.raises(ConfigError, match=f"{option[0]}: expected none with --periods"):
+    with pytest.raises(ConfigError, match=f"{option[0]}: expected no such option with --periods"):
         compare(runs, "--periods", "0:1", *option)
 
 
 def test_a_scene_without_effect_is_refused(runs, scene):
-    with pytest.raises(ConfigError, match="--scene: expected none without --periods"):
+    with pytest.raises(ConfigError, match="--scene: expected no such option without --periods"):
         compare(runs, "--scene", scene)

@@ -114,7 +114,7 @@ def test_a_loss_beyond_all_images_is_a_usage_error():
 
 
 def test_a_loss_means_nothing_to_the_plain_form(trained):
-    with pytest.raises(ConfigError, match="--max-loss: expected none with --plain"):
+    with pytest.raises(ConfigError, match="--max-loss: expected no such option with --plain"):
         compress(trained["chronogs"], "--plain", "--max-loss", "0.5")
 
 

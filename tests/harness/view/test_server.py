@@ -299,9 +299,12 @@ def test_without_viser(trained, monkeypatch):
 
 def test_options_without_effect_are_refused(trained, scene_folder):
     for arguments, message in (
-        ((trained["chronogs"], "--period-by", "year"), "--period-by: expected none with runs"),
-        ((scene_folder, "--device", "cpu"), "--device: expected none without a run"),
-        ((scene_folder, "--scene", scene_folder), "--scene: expected none without a run"),
+        (
+            (trained["chronogs"], "--period-by", "year"),
+            "--period-by: expected no such option with runs",
+        ),
+        ((scene_folder, "--device", "cpu"), "--device: expected no such option without a run"),
+        ((scene_folder, "--scene", scene_folder), "--scene: expected no such option without a run"),
     ):
         result = CliRunner().invoke(cli, ["view", *map(str, arguments)])
         assert message in str(result.exception)
