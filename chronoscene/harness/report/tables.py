@@ -115,7 +115,9 @@ def _renamed(labels: Iterable[str], renames: Mapping[str, str] | None) -> dict[s
         if changed == names or len({*changed.values()}) < len(changed) or "" in changed.values():
             raise ConfigError(
                 f"--rename {old}={new}",
-                expected="a part of names that still differ afterwards",
+                expected="a part of one of the names"
+                if changed == names
+                else "names that still differ afterwards",
                 found=f"the names {', '.join(map(repr, names.values()))}",
                 todo="correct OLD, or choose another NEW",
             )

@@ -209,7 +209,7 @@ def test_names_and_columns_can_be_chosen(tmp_path):
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        (("--rename", "5DGS=x"), "--rename 5DGS=x: expected a part of names"),
+        (("--rename", "5DGS=x"), "--rename 5DGS=x: expected a part of one of the names"),
         (("--rename", "3DGS=4DGS"), "names that still differ afterwards"),
         (("--rename", "3DGS"), "--rename: expected OLD=NEW"),
         (("--columns", "macros"), "--columns: expected one of .*macro"),
