@@ -76,9 +76,8 @@ def command() -> None:
         Diagnosis("memory", "ok", in_words(machine_memory()[0])),
         Diagnosis("disk", "ok", f"{in_words(shutil.disk_usage(Path.cwd()).free)} free here"),
     ]
-    heads = [(head, "") for head in ("part", "state", "found")]
     rows = [(d.what, d.state, d.found) for d in diagnoses]
-    table = Table(heads, rows, labels=len(heads), title="What works on this machine")
+    table = Table(["part", "state", "found"], rows, labels=3, title="What works on this machine")
     emit(plain_text(table) + "\n")
     for diagnosis in diagnoses:
         if diagnosis.todo:

@@ -19,8 +19,8 @@ from chronoscene.io.wording import printable
 FORMATS = ("table", "csv", "markdown", "latex", "json")
 """Formats of tables; ``table`` is text for a terminal."""
 
-Head = tuple[str, str]
-"""Two lines; a column whose first line is empty shares that of the column before."""
+Head = str | tuple[str, str]
+"""One line, or two; a column whose first line is empty shares that of the column before."""
 LEGENDS = {
     "table": "¹, ², ³: the first three of a column",
     "markdown": "**bold**, <ins>underlined</ins>, *italic*: the first three of a column",
@@ -57,12 +57,17 @@ class Table:
     """Rows that are followed by a rule or a gap."""
 
     @property
+    def head_lines(self) -> list[tuple[str, str]]:
+        """Both lines of each head."""
+        return [(head, "") if isinstance(head, str) else head for head in self.heads]
+
+    @property
     def flat_heads(self) -> list[str]:
         """Heads on one line, each complete in itself."""
         flat, first = [], ""
-        for head in self.heads:
-            first = head[0] or first
-            flat.append(" ".join(filter(None, (first, head[1]))))
+        for above, below in self.head_lines:
+            first = above or first
+            flat.append(" ".join(filter(None, (first, below))))
         return flat
 
 
@@ -111,7 +116,7 @@ def boxed_text(table: Table, *, width: int | None = None) -> str:
         [_marked(table, i, j, printable(cell), "table") for j, cell in enumerate(row)]
         for i, row in enumerate(table.rows)
     ]
-    heads = [(printable(first), printable(second)) for first, second in table.heads]
+    heads = [(printable(first), printable(second)) for first, second in table.head_lines]
     table = replace(table, heads=heads)
     columns = zip(*(zip(*heads, strict=True)), *rows, strict=True)
     sizes = [GAP + max(map(cell_len, column)) for column in columns]
@@ -133,7 +138,7 @@ def _fitting(table: Table, sizes: Sequence[int], width: int) -> list[list[int]]:
     """Divide columns into blocks; those with a common head stay together."""
     groups: list[list[int]] = []
     for i in range(table.labels, len(sizes)):
-        if groups and not table.heads[i][0]:
+        if groups and not table.head_lines[i][0]:
             groups[-1].append(i)
         else:
             groups.append([i])
@@ -155,10 +160,11 @@ def _block(
     from rich.console import Console
     from rich.table import Table as RichTable
 
-    two_lines = any(table.heads[i][1] for i in columns)
+    heads = table.head_lines
+    two_lines = any(heads[i][1] for i in columns)
     drawn = RichTable(box=box.SIMPLE_HEAD, padding=(0, GAP - 1, 0, 0), collapse_padding=True)
     for i in columns:
-        head = "\n".join(table.heads[i] if two_lines else table.heads[i][:1])
+        head = "\n".join(heads[i] if two_lines else heads[i][:1])
         if i < table.labels:
             drawn.add_column(head, max_width=longest, overflow="ellipsis")
         else:
@@ -216,7 +222,7 @@ def latex(table: Table, *, cmidrules: bool = False) -> str:
     lines += [
         rf"\begin{{tabular}}{{{'l' * table.labels}{'r' * (len(table.heads) - table.labels)}}}",
         r"\toprule",
-        *_latex_heads(table.heads, cmidrules),
+        *_latex_heads(table.head_lines, cmidrules),
         r"\midrule",
     ]
     for i, row in enumerate(table.rows):
@@ -227,7 +233,7 @@ def latex(table: Table, *, cmidrules: bool = False) -> str:
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
-def _latex_heads(heads: Sequence[Head], cmidrules: bool) -> list[str]:
+def _latex_heads(heads: Sequence[tuple[str, str]], cmidrules: bool) -> list[str]:
     """Format one row of heads, or two, where common heads of several columns stand above them."""
     if not any(second for _, second in heads):
         return [_latex_row([escape_latex(first) for first, _ in heads])]

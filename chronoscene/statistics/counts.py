@@ -13,7 +13,7 @@ import numpy as np
 from chronoscene import __version__
 from chronoscene.arrays import Ints
 from chronoscene.io import tables
-from chronoscene.io.tables import Table
+from chronoscene.io.tables import Head, Table
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
 
@@ -173,7 +173,7 @@ def _period_names(counts: Sequence[SceneCount]) -> list[str]:
 
 def _table(counts: Sequence[SceneCount], images: str, points: str) -> Table:
     """Make the table for readers."""
-    heads = [("Scene", "")]
+    heads: list[Head] = ["Scene"]
     for name in _period_names(counts):
         heads += [(name, images), ("", points)]
     rows = [

@@ -31,11 +31,11 @@ class DetailColumn:
 
 
 COLUMNS = (
-    DetailColumn("images", ("Images", "")),
+    DetailColumn("images", "Images"),
     DetailColumn("test", ("", "test")),
-    DetailColumn("points", ("Points", "")),
+    DetailColumn("points", "Points"),
     DetailColumn("points_seen", ("", "seen")),
-    DetailColumn("observations", ("Observations", "")),
+    DetailColumn("observations", "Observations"),
     DetailColumn("track_mean", ("Track", "mean"), decimals=2),
     DetailColumn("track_median", ("", "median"), decimals=1),
     DetailColumn("reprojection_error", ("Error", "[px]"), decimals=3),
@@ -140,7 +140,7 @@ def _table(statistics: Sequence[SceneStatistics]) -> Table:
         for title in ("Also seen by", "In view of")
         for i in range(shown)
     ]
-    heads = [("Scene", ""), ("Period", ""), *(c.head for c in COLUMNS), *titles]
+    heads = ["Scene", "Period", *(c.head for c in COLUMNS), *titles]
     rows = [row for scene in statistics for row in rows_of(scene)]
     lines = []
     for row in rows:

@@ -22,7 +22,7 @@ def test_pictures_are_in_the_page(form):
 
 def test_tables_have_their_marks_and_names_are_only_text():
     table = Table(
-        [("method", ""), ("scene", "PSNR"), ("", "SSIM")],
+        ["method", ("scene", "PSNR"), ("", "SSIM")],
         [["<b>A</b>", "21.0", "0.5"], ["B", "20.0", "0.6"]],
         title="a & b",
         ranks={(0, 1): 1, (1, 2): 1},

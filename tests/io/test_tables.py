@@ -18,7 +18,7 @@ from chronoscene.io.tables import (
     text_of,
 )
 
-HEADS = [("name", ""), ("size", "[m]"), ("", "[px]")]
+HEADS = ["name", ("size", "[m]"), ("", "[px]")]
 TABLE = Table(
     HEADS, [["a_b", "1.0", "2"], ["[c", "30.5", "4"]], title="Sizes", ranks={(1, 1): 1}, breaks={0}
 )
@@ -58,8 +58,8 @@ def test_a_list_has_no_markup_of_its_own():
 
 @pytest.mark.parametrize("style", ["table", "markdown", "latex"])
 def test_names_of_several_lines_are_on_one(style):
-    odd = Table([("a\nb", ""), ("c\rd", "e\nf")], [["g\nh", "1"]], title="i\nj")
-    plain = Table([("a", ""), ("c", "e")], [["g", "1"]], title="i")
+    odd = Table(["a\nb", ("c\rd", "e\nf")], [["g\nh", "1"]], title="i\nj")
+    plain = Table(["a", ("c", "e")], [["g", "1"]], title="i")
     found = text_of(odd, style)
     assert found.count("\n") == text_of(plain, style).count("\n")
     assert "\r" not in found and found.splitlines()[0].endswith(("j", "j**"))
@@ -88,7 +88,7 @@ def test_latex(cmidrules):
 def test_ranks_and_ties_are_marked():
     rows = [[name, value] for name, value in zip("abcd", ("9", "8", "7", "6"), strict=True)]
     ranks = {(0, 1): 1, (1, 1): 2, (2, 1): 3}
-    table = Table([("n", ""), ("v", "")], rows, ranks=ranks, ties={(1, 1), (3, 1)})
+    table = Table(["n", "v"], rows, ranks=ranks, ties={(1, 1), (3, 1)})
     assert [line.split(maxsplit=1)[1] for line in boxed_text(table).split("\n")[3:7]] == [
         *("¹ 9", "†² 8", "³ 7", "†6")
     ]
@@ -105,7 +105,7 @@ def test_ranks_and_ties_are_marked():
 
 def test_labels_go_over_lines_where_that_saves_a_block():
     name = "Scaffold-GS, period appearance (joint, fast)"
-    table = Table([("method", ""), *[("x" * 15, "")] * 3], [[name, "1", "2", "3"]], title="Title")
+    table = Table(["method", *["x" * 15] * 3], [[name, "1", "2", "3"]], title="Title")
     lines = boxed_text(table, width=80).splitlines()
     assert lines[0] == "Title" and max(map(len, lines)) <= 80
     texts = [line.split("  ")[0].strip() for line in lines]
@@ -113,7 +113,7 @@ def test_labels_go_over_lines_where_that_saves_a_block():
     first = texts.index("Scaffold-GS, period")
     assert texts[first : first + 2] == ["Scaffold-GS, period", "appearance (joint, fast)"]
     assert name in boxed_text(table)
-    heads = [("method", ""), *[("plaza", "x" * 12), ("", "x" * 12), ("", "x" * 12)] * 2]
+    heads = ["method", *[("plaza", "x" * 12), ("", "x" * 12), ("", "x" * 12)] * 2]
     text = boxed_text(Table(heads, [[name, *"123456"]]), width=80)
     assert text.count("plaza") == 2 and max(map(len, text.splitlines())) <= 80
 
@@ -124,7 +124,7 @@ def test_csv():
 
 def test_wide_tables_are_cut_into_blocks_with_their_labels():
     assert boxed_text(TABLE).count("name") == 1
-    heads = [*HEADS, ("other", "")]
+    heads = [*HEADS, "other"]
     wide = Table(heads, [[*row, "x" * 8] for row in TABLE.rows])
     text = boxed_text(wide, width=20)
     assert text.count("name") == 2 and max(map(len, text.splitlines())) <= 20

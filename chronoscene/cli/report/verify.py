@@ -48,12 +48,11 @@ def command(folders: tuple[Path, ...], entries: Path | None, lpips_weights: Path
 
 
 def _table(found: list[Verified]) -> Table:
-    heads = ("run", "views", "metrics", "largest difference", "verdict")
     rows = [
         (run.label, str(run.views), str(len(run.metrics)), f"{run.largest:.3g}", run.verdict)
         for run in found
     ]
-    return Table([(head, "") for head in heads], rows)
+    return Table(["run", "views", "metrics", "largest difference", "verdict"], rows)
 
 
 def _findings(found: list[Verified]) -> str:

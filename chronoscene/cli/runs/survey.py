@@ -100,7 +100,7 @@ def _print(summary: Mapping[str, Any]) -> None:
     if rows:
         names = ("periods", "polygon", "area, m²", "fill, m³", "cut, m³", "net, m³")
         title = "Volumes with their 95 % intervals"
-        table = Table([(name, "") for name in names], rows, labels=2, title=title)
+        table = Table(names, rows, labels=2, title=title)
         emit(boxed_text(table, width=terminal_width()))
     for period in summary["periods"]:
         emit(f"period {period['label']}: {period['points']:,} points\n")

@@ -57,7 +57,7 @@ def _table() -> Table:
         for name, dataset in DATASETS.items()
     ]
     rows.append((WEIGHTS, "VGG16 and the heads of LPIPS", "PyTorch, GitHub", "BSD", ""))
-    heads = [(head, "") for head in ("name", "dataset", "host", "licence", "format")]
+    heads = ["name", "dataset", "host", "licence", "format"]
     return Table(heads, rows, labels=len(heads), title="What can be downloaded")
 
 

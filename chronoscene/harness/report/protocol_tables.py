@@ -75,7 +75,7 @@ def _table(name: str, rows: Sequence[ProtocolRow]) -> Table:
         found = [(row.values[info.name], info.decimals) for info in infos]
         texts = ["-" if value is None else f"{value:.{digits}f}" for value, digits in found]
         cells.append([row.method, *texts, "-" if row.scenes is None else str(row.scenes)])
-    heads = [("method", ""), *((info.title, "") for info in infos), ("scenes", "")]
+    heads = ["method", *(info.title for info in infos), "scenes"]
     title = f"{PROTOCOLS[name].title} (--protocol {name}): means over all test views of a scene"
     breaks = {sum(row.source == MEASURED for row in rows) - 1}
     return Table(heads, cells, title=title, breaks=breaks)

@@ -10,7 +10,7 @@ from chronoscene.harness.files.records import RunRecord
 from chronoscene.harness.report.summary import in_unit, labelled
 from chronoscene.harness.report.tables import period_name
 from chronoscene.harness.score.regions import ALL
-from chronoscene.io.tables import Table
+from chronoscene.io.tables import Head, Table
 from chronoscene.metrics.registry import metric_info
 
 if TYPE_CHECKING:
@@ -69,11 +69,8 @@ def worst_views(scores: DataFrame, records: Sequence[RunRecord], metric: str) ->
             for (_, period, view), values in zip(there.index, there.to_numpy(), strict=True)
         ]
         names = [label.partition(" (") for label in there.columns]
-        heads = [
-            ("view", ""),
-            ("period", ""),
-            *((name, (bracket + kind).strip()) for name, bracket, kind in names),
-        ]
+        heads: list[Head] = ["view", "period"]
+        heads += [(name, (bracket + kind).strip()) for name, bracket, kind in names]
         title = f"{scene}: {info.title} ({metric}) of single views, worst mean over methods first"
         if len(rows) > WORST:
             title += f"; {WORST} of {len(rows)}"

@@ -134,7 +134,7 @@ def with_columns(made: Iterable[Table], names: Sequence[str]) -> list[Table]:
     kept, known = [], set()
     for table in made:
         chosen, heads, group, last = [*range(table.labels)], [*table.heads[: table.labels]], "", ""
-        for j, (first, second) in [*enumerate(table.heads)][table.labels :]:
+        for j, (first, second) in [*enumerate(table.head_lines)][table.labels :]:
             group = first or group
             texts = {text for text in (group, second, table.flat_heads[j]) if text}
             texts |= {text.partition(" [")[0] for text in texts}  # without the unit
@@ -254,7 +254,7 @@ def _table(title: str, labels: Sequence[str], columns: Sequence[_Column], **opti
                 ranks[places[label], j] = rank
             if field in ("text", "number") and tied:
                 ties.add((places[label], j))
-    heads = [("method", ""), *(column.head for column in columns)]
+    heads = ["method", *(column.head for column in columns)]
     return Table(heads, rows, title=title, ranks=ranks, ties=ties, **options)
 
 
@@ -278,10 +278,10 @@ def _overviews(entries: DataFrame, names: Sequence[str], *, size: bool) -> Itera
             head = metric_info(name).title if len(names) > 1 else ""
             first = "" if i else scene
             found = macro[macro.quantity == name]
-            columns.append(_Column((first, head) if several else (head, ""), found, "number"))
+            columns.append(_Column((first, head) if several else head, found, "number"))
     if size:
         sizes = parts[-1][1].query("quantity == @SIZE")
-        columns.append(_Column((COST_TITLES[SIZE], ""), sizes, "number"))
+        columns.append(_Column(COST_TITLES[SIZE], sizes, "number"))
     step = MAX_SCENES * len(names)
     starts = range(0, len(parts) * len(names), step)
     for start in starts:
@@ -304,17 +304,17 @@ def _quality_tables(
     none = found[:0]
     ids = sorted({i for run in runs for i in run.periods}, key=int)
     single = [
-        _Column((period_title(i, runs[0].period_labels), ""), by_column.get(f"period {i}", none))
+        _Column(period_title(i, runs[0].period_labels), by_column.get(f"period {i}", none))
         for i in ids
     ]
     few = len(ids) <= MAX_PERIODS
     over = [
-        _Column((name, ""), by_column.get(name, none))
+        _Column(name, by_column.get(name, none))
         for name, _, _, for_many in AGGREGATES
         if not (few and for_many)
     ]
     over[1:1] = _uncertainty(by_column.get("macro", none))
-    count = _Column(("n", ""), part.drop_duplicates("label"), "runs")
+    count = _Column("n", part.drop_duplicates("label"), "runs")
     made = [_table(title, labels, [*(single if few else ()), *over, count])]
     for start in range(0, len(ids), MAX_PERIODS) if every and not few else ():
         chosen = slice(start, start + MAX_PERIODS)
@@ -374,13 +374,13 @@ def _stage_tables(
         for label in labels
         for number, (stage, after) in enumerate(zip(stages, ["no training", *titles], strict=True))
     ]
-    heads = [(name, "") for name in ("method", "after", *titles)]
+    heads = ["method", "after", *titles]
     title = f"{runs[0].scene}: {metric_info(metric).title} ({metric}) after"
     breaks = range(len(stages) - 1, len(rows) - 1, len(stages))
     matrix = Table(heads, rows, labels=2, title=f"{title} each stage", breaks=breaks)
     columns = ("macro", *TRANSFERS)
     rows = [[label, *(texts.get((label, column), "-") for column in columns)] for label in labels]
-    heads = [("method", ""), *((column.replace("_", " "), "") for column in columns)]
+    heads = ["method", *(column.replace("_", " ") for column in columns)]
     left = Table(heads, rows, title=f"{title} the last stage")
     return [matrix, left] if every or len(ids) <= MAX_PERIODS else [left]
 
@@ -388,7 +388,7 @@ def _stage_tables(
 def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str] = ()) -> Table:
     """Make the table of macro means and costs of the runs on one scene."""
     costs, macro = part[part.column == ""], part[part.column == "macro"]
-    columns = [_Column((metric_info(m).title, ""), macro[macro.quantity == m]) for m in metrics]
+    columns = [_Column(metric_info(m).title, macro[macro.quantity == m]) for m in metrics]
     for cost in COSTS:
         found = costs[costs.quantity == cost.name]
         if cost.name in TIMES and found.device.nunique() > 1:
@@ -396,8 +396,8 @@ def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str] = ()) -> Tab
             by_device = zip(heads, found.groupby("device", sort=False), strict=True)
             columns += [_Column((head, device), part) for head, (device, part) in by_device]
         elif len(found):
-            columns.append(_Column((cost.title, ""), found))
-    columns.append(_Column(("seeds", ""), part.drop_duplicates("label"), "seeds"))
+            columns.append(_Column(cost.title, found))
+    columns.append(_Column("seeds", part.drop_duplicates("label"), "seeds"))
     title = f"{scene}: macro means and cost" if metrics else f"{scene}: cost"
     return _table(title, part.label.unique(), columns)
 
@@ -406,7 +406,7 @@ def _sharing_tables(part: DataFrame, scene: str) -> list[Table]:
     """Make the table of what the periods share in each method that can tell, if any can."""
     by_quantity = [(cost.title, part[part.quantity == cost.name]) for cost in SHARING]
     labels = by_quantity[0][1].label.unique()
-    columns = [_Column((title, ""), found) for title, found in by_quantity]
+    columns = [_Column(title, found) for title, found in by_quantity]
     return [_table(f"{scene}: what periods share", labels, columns)] if len(labels) else []
 
 

@@ -174,7 +174,7 @@ def _table(title: str, part: DataFrame, quantity: str, more: dict[str, str]) -> 
     """Put configurations in rows, places of a quantity and further quantities in columns."""
     places = sorted({*part[part.quantity == quantity]["at"]})
     spell = in_time if quantity == "psnr" else "{:g} dB".format
-    heads = [(text, "") for text in ("method", *map(spell, places), *more.values())]
+    heads = ["method", *map(spell, places), *more.values()]
     columns = [*((quantity, at) for at in places), *((name, None) for name in more)]
     texts = {}
     for row in part.itertuples():

@@ -160,7 +160,7 @@ def front_tables(points: DataFrame) -> list[Table]:
                 rows.append(["" if number else what, point.label, value, quality])
             breaks.append(len(rows) - 1)
         name = metric_info(metric).title
-        heads = [(head, "") for head in ("against", "method", "cost", name)]
+        heads = ["against", "method", "cost", name]
         title = f"{scene}: Pareto fronts of {name} ({metric})"
         made.append(Table(heads, rows, labels=2, title=title, breaks=breaks[:-1]))
     return made

@@ -24,7 +24,7 @@ from chronoscene.harness.report.tables import COST_TITLES, footnotes, interval_t
 from chronoscene.harness.score.scoring import read_scored
 from chronoscene.harness.study.plan import Study
 from chronoscene.io import tables
-from chronoscene.io.tables import Table
+from chronoscene.io.tables import Head, Table
 from chronoscene.metrics.registry import all_metrics, metric_info
 
 if TYPE_CHECKING:
@@ -109,7 +109,8 @@ def study_table(study: Study, entries: DataFrame) -> Table:
         for entry in entries.to_dict("records")
     }
     labels = [(scene, row.label) for scene in measured.scene.unique() for row in study.rows]
-    heads, columns = [("scene", ""), ("row", "")], []
+    heads: list[Head] = ["scene", "row"]
+    columns = []
     for quantity in _quantities(study, entries):
         metric = quantity in all_metrics()
         title = metric_info(quantity).title if metric else COST_TITLES[quantity]
@@ -124,7 +125,7 @@ def study_table(study: Study, entries: DataFrame) -> Table:
             heads.append(("", f"{place} (published)"))
             known = [by_key.get((study.source, place, label, quantity)) for _, label in labels]
             columns.append([_printed(entry) for entry in known])
-    heads.append(("seeds", ""))
+    heads.append("seeds")
     seeds = {(e["scene"], e["row"]): e["seeds"] for e in measured.to_dict("records")}
     columns.append([seeds.get(label, "-") for label in labels])
     rows = [[*label, *cells] for label, *cells in zip(labels, *columns, strict=True)]

@@ -123,7 +123,7 @@ def trials_table(results: Sequence[TrialResult]) -> Table:
     best = best_of(results)
     options = list(results[0].options) if results else []
     return Table(
-        heads=[(name, "") for name in ("trial", "PSNR", "seconds", "size", *options)],
+        heads=["trial", "PSNR", "seconds", "size", *options],
         rows=[
             [
                 str(result.number),

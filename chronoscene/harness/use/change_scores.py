@@ -22,7 +22,7 @@ from chronoscene.harness.use.changes import (
 from chronoscene.harness.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
 from chronoscene.images.truth import check_distinct, load_changes, truth_place
-from chronoscene.io.tables import Table, csv_text
+from chronoscene.io.tables import Head, Table, csv_text
 from chronoscene.metrics.change import change_scores
 from chronoscene.scene import Frame, Scene
 
@@ -151,7 +151,7 @@ def changes_table(rows: Sequence[Compared], labels: Mapping[str, str], title: st
         title: Title of the table.
     """
     shown = [key for key in SCORES if any(key in scores for _, scores in rows)]
-    heads = [("from", ""), ("to", ""), ("places", "")]
+    heads: list[Head] = ["from", "to", "places"]
     heads += [("of them [%]" if name == CLASSES[1] else "", name) for name in CLASSES[1:]]
     heads += [SCORES[key] for key in shown]
     lines = []

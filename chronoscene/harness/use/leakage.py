@@ -168,7 +168,7 @@ def leakage_table(rows: Iterable[ViewScore], labels: Mapping[str, str], title: s
         chosen = [means for (a, b), means in pairs.items() if (a == b) == own]
         if chosen:
             lines.append(["mean", name, *_texts(_mean(chosen), shown)])
-    heads = [(name, "") for name in ("camera of", "rendered", *(COLUMNS[key][0] for key in shown))]
+    heads = ["camera of", "rendered", *(COLUMNS[key][0] for key in shown)]
     return Table(heads, lines, labels=2, title=title, breaks={len(pairs) - 1})
 
 

@@ -23,7 +23,7 @@ def test_views_stand_worst_first_with_seeds_averaged():
     assert [*scores.index] == views
     assert scores.loc["plaza"].to_numpy().tolist() == [[21.0, 15.0], [12.0, 24.0], [30.0, 31.0]]
     beside, plaza = worst_views(scores, runs, "psnr")
-    assert [head[0] for head in beside.heads] == ["view", "period", "B"]
+    assert [first for first, _ in beside.head_lines] == ["view", "period", "B"]
     assert plaza.flat_heads[2:] == ["A (joint, fast)", "B (joint, fast)"]
     assert plaza.rows[1] == ["1/view0.png", "period 1", "12.00", "24.00"]
     assert plaza.rows[0][1] == "May_2016 & before"

@@ -171,7 +171,7 @@ def test_the_table_has_means_over_views_and_pairs():
             for i, v in enumerate(values[pair])]  # fmt: skip
     rows.append(ViewScore("0", 0, 1, "changed", "ghosting", 0.25))
     table = leakage_table(rows, {"0": "may", "1": "june"}, "title")
-    assert [head for head, _ in table.heads] == ["camera of", "rendered", "PSNR [dB]", "ghosting"]
+    assert table.heads == ["camera of", "rendered", "PSNR [dB]", "ghosting"]
     assert table.rows == [
         ["may", "may", "25.00", "-"],
         ["may", "june", "10.00", "0.250"],

@@ -86,7 +86,7 @@ def between_table(found: SceneBetween) -> Table:
         f"{found.scene}: RMS distance of colours between {names[0]} and {names[1]}, "
         f"{found.pixels} pixels that change by the {mask}"
     )
-    return Table([(head, "") for head in heads], rows, title=title)
+    return Table(heads, rows, title=title)
 
 
 def between_csv(found: Sequence[SceneBetween]) -> str:
