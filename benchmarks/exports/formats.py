@@ -19,7 +19,6 @@ from benchmarks.exports import plain_renderer, readers
 from chronoscene import Scene, TrainedRun, open_run
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.export import make_file, prepare
-from chronoscene.images.store import ImageStore
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.splat_files import SUFFIXES
@@ -27,7 +26,7 @@ from chronoscene.splat_files import SUFFIXES
 
 def measure(run: TrainedRun, scene: Scene, period: int, cloud: GaussianCloud) -> float:
     """Compute the mean PSNR of Gaussians, in the frame of the scene, without the filter."""
-    store = ImageStore(scene, max_width=run.record.max_width)
+    store = run.photos(scene)
     model: Any = run.model(period)
     near_plane = model.config.near_plane / run.training_from_world.scale
     background = model.background.double().numpy()

@@ -24,7 +24,6 @@ from chronoscene.fields.method import FieldMethod
 from chronoscene.fields.network import Codes
 from chronoscene.fields.rays import view_rays
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
-from chronoscene.images.store import ImageStore
 from chronoscene.methods import View
 
 CELL = 1.9  # Inches per image
@@ -52,7 +51,7 @@ def explain(run: TrainedRun, names: list[str]) -> list[dict[str, NDArray[np.floa
     lights: Tensor = method.network.params["light_codes"]
     passing: Tensor = method.network.params["transient_codes"]
     periods = torch.tensor([frame.period for frame in frames])
-    store, rows = ImageStore(scene, max_width=run.record.max_width), []
+    store, rows = run.photos(scene), []
     for name in names:
         (number,) = (i for i, frame in enumerate(frames) if frame.name == name)
         (view,) = run.frame_views(scene, [frames[number]])

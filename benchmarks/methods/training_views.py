@@ -16,14 +16,13 @@ import numpy as np
 
 from chronoscene import Scene, TrainedRun, open_run
 from chronoscene.harness.files.predictions import to_bytes
-from chronoscene.images.store import ImageStore
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Split
 
 
 def macro_psnr(run: TrainedRun, scene: Scene, split: Split, every: int) -> float:
     """Return the mean over periods of the mean PSNR over views of a split, in dB."""
-    store = ImageStore(scene, max_width=run.record.max_width)
+    store = run.photos(scene)
     values: dict[int, list[float]] = defaultdict(list)
     for frame in scene.select(split=split)[::every]:
         image = run.render(store.camera(frame), frame.cam_from_world, frame.period).rgb

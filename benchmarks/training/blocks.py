@@ -30,7 +30,6 @@ from benchmarks.markdown import table
 from chronoscene.edit import Edits, edit
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.trained_run import TrainedRun
-from chronoscene.images.store import ImageStore
 from chronoscene.images.truth import load_depth
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame, Scene
@@ -121,7 +120,7 @@ def main() -> None:
     half = cs.bench(places, given.method, out=out, iterations=given.block_iterations, **options)
     run = cs.open_run(whole.runs[0])
     blocks = sorted(map(cs.open_run, half.runs), key=lambda r: r.record.scene.endswith("high"))
-    store = ImageStore(scene, max_width=run.record.max_width)
+    store = run.photos(scene)
     one = [run.gaussians(period, scene=scene) for period in range(scene.num_periods)]
     two = [joined(blocks, period, axis, cut) for period in range(scene.num_periods)]
 

@@ -31,7 +31,6 @@ from chronoscene.harness.use.changes import usual_pairs
 from chronoscene.harness.use.export import make_file, period_files, prepare
 from chronoscene.harness.use.page import write_page
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
-from chronoscene.images.store import ImageStore
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.log import Log
 from chronoscene.io.processes import Report
@@ -213,7 +212,7 @@ def _page(project: Project) -> Sequence[Path]:
     seen = np.bincount(scene.points.track_frame, minlength=len(scene.frames))
     tests = [i for i, frame in enumerate(scene.frames) if frame.split == "test"]
     frame = scene.frames[max(tests or range(len(scene.frames)), key=lambda i: seen[i])]
-    camera = ImageStore(scene, max_width=run.record.max_width).camera(frame)
+    camera = run.photos(scene).camera(frame)
     for period, path in enumerate(pictures):
         rgb = run.render(camera, frame.cam_from_world, period).rgb
         path.write_bytes(encode_png(to_bytes(rgb)))

@@ -70,10 +70,9 @@ def measure_between(
     Raises:
         ImageError: If a change mask is damaged.
     """
-    max_width = runs[0].record.max_width
-    store = ImageStore(scene, max_width=max_width)
+    store = runs[0].photos(scene)
     frames = [frame for frame in scene.select(split="test") if frame.period in dates]
-    changes = _true_changes(scene.root / "gt", store, frames, dates, max_width)
+    changes = _true_changes(scene.root / "gt", store, frames, dates, runs[0].record.max_width)
     sums, pixels = np.zeros((len(runs), len(FRACTIONS) + 1)), 0
     shown: list[list[Pixels]] = []
     for number, frame in enumerate(frames):

@@ -16,7 +16,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.formats.shared import transforms
 from chronoscene.harness.files.predictions import image_file
 from chronoscene.harness.use.trained_run import TrainedRun
-from chronoscene.images.store import ImageStore, evaluation_size, resize_camera
+from chronoscene.images.store import evaluation_size, resize_camera
 from chronoscene.io.documents import json_error, number, read_json_document
 from chronoscene.scene import Camera, Scene
 from chronoscene.scene.cameras import undistorted_camera
@@ -178,7 +178,7 @@ def _range(run: TrainedRun, periods: tuple[float, ...], count: int) -> Iterable[
 
 
 def _of_scene(run: TrainedRun, scene: Scene, split: str) -> CameraSequence:
-    store = ImageStore(scene, max_width=run.record.max_width)
+    store = run.photos(scene)
     frames = scene.frames if split == "all" else scene.select(split="test")
     viewpoints = (
         Viewpoint(image_file(f.name), store.camera(f), f.cam_from_world, float(f.period))
@@ -189,7 +189,7 @@ def _of_scene(run: TrainedRun, scene: Scene, split: str) -> CameraSequence:
 
 def _around(run: TrainedRun, scene: Scene, frames: int, shape: OrbitShape) -> CameraSequence:
     poses = np.stack([frame.cam_from_world for frame in scene.frames])
-    camera = ImageStore(scene, max_width=run.record.max_width).camera(scene.frames[0])
+    camera = run.photos(scene).camera(scene.frames[0])
     if shape.size is not None:
         width, height = shape.size  # with the same horizontal field of view
         camera = _centred(width, height, camera.K[0, 0] * width / camera.width)

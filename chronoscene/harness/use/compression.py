@@ -147,7 +147,7 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
             found="a compressed one, whose losses would add up",
             todo="compress the run that it was made from",
         )
-    store = ImageStore(scene, max_width=run.record.max_width)
+    store = run.photos(scene)
     label = "plain" if max_loss is None else f"{max_loss:g}dB"
     variant = ",".join(filter(None, (run.record.variant, f"compressed={label}")))
     out = run.folder.resolve()
@@ -202,9 +202,8 @@ def _opened(
         model.permute(np.argsort(morton(grid.codes(stored[name])), kind="stable"))
         model.save(scratch)
         tensors = load_file(scratch / TENSOR_FILE)
-        width = run.record.max_width
-        store, small = (ImageStore(scene, max_width=w) for w in (width, min(width, PROBE_WIDTH)))
-        yield _SortedModel(run, frames, store, small, scratch, tensors, {name: grid})
+        small = ImageStore(scene, max_width=min(run.record.max_width, PROBE_WIDTH))
+        yield _SortedModel(run, frames, run.photos(scene), small, scratch, tensors, {name: grid})
 
 
 def _fit(model: _SortedModel, max_loss: float, log: Log) -> dict[str, Columns]:

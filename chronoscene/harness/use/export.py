@@ -14,7 +14,6 @@ from chronoscene.arrays import Array
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import safe_part, to_bytes
 from chronoscene.harness.use.trained_run import TrainedRun
-from chronoscene.images.store import ImageStore
 from chronoscene.io.wording import counted, printable
 from chronoscene.methods import Prediction, View
 from chronoscene.metrics.psnr_ssim import psnr
@@ -193,7 +192,7 @@ def _psnr(
     images: Callable[[View], Iterator[Prediction]],
 ) -> Array:
     """Return the PSNR of several images of each view against its photo, if any of it counts."""
-    store = ImageStore(scene, max_width=run.record.max_width)
+    store = run.photos(scene)
     values = []
     for frame, view in zip(frames, run.frame_views(scene, frames), strict=True):
         photo, mask = store.load(frame), store.load_mask(frame)

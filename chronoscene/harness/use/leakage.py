@@ -66,7 +66,7 @@ def measure_leakage(run: TrainedRun, scene: Scene, truth: Path) -> Iterator[list
         ImageError: If a file of the truth is damaged or that of two views, or a change mask has
             another size.
     """
-    store = ImageStore(scene, max_width=run.record.max_width)
+    store = run.photos(scene)
     check_distinct(truth, (frame.name for frame in scene.select(split="test")))
     for frame in scene.select(split="test"):
         camera, mask = store.camera(frame), store.load_mask(frame)

@@ -91,7 +91,7 @@ def write_page(
     with staged_folder(out) as staged:
         clouds = _gaussians(runs, scene, periods, page_from_world, report)
         document = _document(runs, scene, frames, periods, page_from_world, clouds[0][0])
-        photos = _Photos(ImageStore(scene, max_width=runs[0].record.max_width), staged)
+        photos = _Photos(runs[0].photos(scene), staged)
         room = max_bytes - _size_of_rest(document, runs, periods)
         for frame in _test_first(frames):
             if frame.split == "test" and photos.size < TEST_PHOTO_SHARE * max_bytes:
@@ -181,7 +181,7 @@ def _document(
     cloud: GaussianCloud,
 ) -> dict[str, Any]:
     """Collect what the page knows beside the Gaussians, in its frame and axes."""
-    store = ImageStore(scene, max_width=runs[0].record.max_width)
+    store = runs[0].photos(scene)
     poses = page_from_world.apply_to_pose(np.stack([frame.cam_from_world for frame in frames]))
     points = scene.points.xyz[np.isfinite(scene.points.xyz).all(axis=1)]
     middle = page_from_world.apply(points) if len(points) else cloud.means.astype(np.float64)

@@ -190,9 +190,13 @@ class TrainedRun:
         pose = self.training_from_world.apply_to_pose(cam_from_world)
         return View(camera.K, camera.width, camera.height, pose)
 
+    def photos(self, scene: Scene) -> ImageStore:
+        """Return the photos of the scene, at the size of the training."""
+        return ImageStore(scene, max_width=self.record.max_width)
+
     def frame_views(self, scene: Scene, frames: Iterable[Frame]) -> list[View]:
         """Return frames of the scene as `view` does, at the size of the training."""
-        store = ImageStore(scene, max_width=self.record.max_width)
+        store = self.photos(scene)
         return [self.view(store.camera(frame), frame.cam_from_world) for frame in frames]
 
     def render(

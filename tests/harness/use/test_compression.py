@@ -164,7 +164,8 @@ def test_the_model_of_a_period_is_judged_by_photos_of_that_period(
     ):
         run = SimpleNamespace(
             strategy=STRATEGIES[strategy],
-            record=SimpleNamespace(max_width=1600, variant=""),
+            record=SimpleNamespace(variant=""),
+            photos=ImageStore,
             folder=tmp_path / "scene/method/seed0",
             num_periods=2,
         )

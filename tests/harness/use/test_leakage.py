@@ -22,6 +22,7 @@ from chronoscene.harness.use.leakage import (
 )
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.images.decoding import load_rgb
+from chronoscene.images.store import ImageStore
 from chronoscene.images.truth import APPEARANCE, GEOMETRY, truth_place
 from chronoscene.metrics.psnr_ssim import psnr
 
@@ -144,7 +145,7 @@ def test_masks_of_photos_and_all_other_periods(make_scene, tmp_path):
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(rng.integers(0, 256, (16, 24, 3), dtype=np.uint8)).save(path)
     run = SimpleNamespace(
-        record=SimpleNamespace(max_width=1600),
+        photos=ImageStore,
         num_periods=3,
         render=lambda camera, pose, period: SimpleNamespace(rgb=shown[period], depth=None),
     )
