@@ -38,7 +38,7 @@ def save_model(scene: Scene, path: Path) -> None:
         np.savez_compressed(
             file,
             about=np.frombuffer(json.dumps(about).encode(), np.uint8),
-            poses=np.stack([f.cam_from_world for f in scene.frames]),
+            poses=scene.frame_poses,
             xyz=points.xyz.astype(np.float32),
             rgb=points.rgb,
             seen_by=np.diff(points.track_start).astype(np.uint16),

@@ -119,7 +119,7 @@ def make_distorted(make_scene_folder, tmp_path):
         scene = read_scene(make_scene_folder(names, name=f"{name}-source", tests=["a/1", "b/2"]))
         points = scene.points
         xyz = np.repeat(points.xyz, np.diff(points.track_start), axis=0)
-        poses = np.stack([f.cam_from_world for f in scene.frames])[points.track_frame]
+        poses = scene.frame_poses[points.track_frame]
         rays = np.einsum("nij,nj->ni", poses[:, :3, :3], xyz) + poses[:, :3, 3]
         xy = distort(camera.model, camera.params, *(rays[:, :2] / rays[:, 2:]).T)
         scene = scene.with_frames([dataclasses.replace(f, camera=camera) for f in scene.frames])
@@ -144,7 +144,7 @@ def make_distorted(make_scene_folder, tmp_path):
 def reprojection_errors(scene):
     points = scene.points
     xyz = np.repeat(points.xyz, np.diff(points.track_start), axis=0)
-    poses = np.stack([f.cam_from_world for f in scene.frames])[points.track_frame]
+    poses = scene.frame_poses[points.track_frame]
     Ks = np.stack([f.camera.K for f in scene.frames])[points.track_frame]
     x = np.einsum("nij,nj->ni", poses[:, :3, :3], xyz) + poses[:, :3, 3]
     pixels = np.einsum("nij,nj->ni", Ks, x / x[:, 2:])[:, :2]

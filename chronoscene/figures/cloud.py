@@ -61,7 +61,7 @@ class Cloud:
 
 def cloud_of(scene: Scene) -> Cloud:
     """Collect the points and cameras of a scene."""
-    poses = np.stack([f.cam_from_world for f in scene.frames])
+    poses = scene.frame_poses
     return Cloud(
         name=printable(scene.name),
         unit=scene.world.unit,

@@ -179,7 +179,7 @@ def _has_poses(model: Path, scene: Scene) -> bool:
     if images is None or not all(frame.name in row for frame in scene.frames):
         return False
     rows = [row[frame.name] for frame in scene.frames]
-    poses = np.stack([frame.cam_from_world for frame in scene.frames])
+    poses = scene.frame_poses
     return all(
         np.allclose(a, b, rtol=1e-9, atol=1e-9)
         for a, b in (

@@ -165,6 +165,11 @@ class Scene:
         """Period of each frame. [F]"""
         return np.array([f.period for f in self.frames], np.int64)
 
+    @property
+    def frame_poses(self) -> NDArray[np.float64]:
+        """``cam_from_world`` of each frame. [F, 4, 4]"""
+        return np.stack([f.cam_from_world for f in self.frames])
+
     def count_views(self) -> NDArray[np.int64]:
         """Count the images of each period that see a point. [P, T]"""
         return count_views(*self._sightings(), (len(self.points), self.num_periods))

@@ -252,7 +252,7 @@ def whole_periods(scene: Scene, settings: SplitSettings, times: Times) -> set[st
 
 def blocked(scene: Scene, settings: SplitSettings, times: Times) -> set[str]:
     """Choose the images of whole blocks of camera positions; by default, of two blocks."""
-    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    centres = camera_centre(scene.frame_poses)
     count = settings.blocks or max(2, round(2 / min(settings.fraction, 1 - settings.fraction)))
     if count > len(centres):
         raise ConfigError(

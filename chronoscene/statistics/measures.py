@@ -132,7 +132,7 @@ def camera_baselines(scene: Scene, depths: Array) -> Array:
     Returns:
         NaN for cameras without points, and for one that is alone in its period. [frames]
     """
-    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    centres = camera_centre(scene.frame_poses)
     periods = scene.frame_periods
     nearest = np.full(len(centres), np.nan)
     for period in range(scene.num_periods):

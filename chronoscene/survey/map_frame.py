@@ -71,7 +71,7 @@ def map_frame(scene: Scene, crs: str | None) -> MapFrame:
         SceneError: If the world is not in metres, or its z axis does not point up.
         ConfigError: If a reference system cannot be used, or the scene has none to convert from.
     """
-    poses = np.stack([frame.cam_from_world for frame in scene.frames])
+    poses = scene.frame_poses
     _check_world(scene, poses, crs)
     if scene.world.crs is None:
         return MapFrame(LOCAL, np.eye(3), np.zeros(3), error=0.0)

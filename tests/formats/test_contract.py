@@ -116,7 +116,7 @@ def test_observations_reproject(sample):
     """Cameras, poses, points and tracks belong together: samples are free of noise."""
     scene = read_scene(sample[1])
     points = np.repeat(scene.points.xyz, np.diff(scene.points.track_start), axis=0)
-    poses = np.stack([f.cam_from_world for f in scene.frames])[scene.points.track_frame]
+    poses = scene.frame_poses[scene.points.track_frame]
     Ks = np.stack([f.camera.K for f in scene.frames])[scene.points.track_frame]
     x = np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3]
     pixels = np.einsum("nij,nj->ni", Ks, x)

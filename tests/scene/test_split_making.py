@@ -111,7 +111,7 @@ def test_blocks_are_the_same_in_all_periods(seed):
     """No training camera of any period is inside of the box of a test block."""
     scene = flights()
     split = make_split(scene, SplitSettings("blocked", 0.25, seed=seed, blocks=8))
-    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    centres = camera_centre(scene.frame_poses)
     block = cut_into_blocks(centres, 8)
     is_test = np.array([f.split == "test" for f in split.scene.frames])
     assert len(set(block[is_test])) == 2 and not set(block[is_test]) & set(block[~is_test])

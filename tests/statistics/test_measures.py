@@ -74,7 +74,7 @@ def test_everything_equals_plain_loops(scene: Scene) -> None:
         ]
         for i in range(len(points))
     ]
-    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    centres = camera_centre(scene.frame_poses)
     for p, measured in enumerate(found.periods):
         mine = [j for j, f in enumerate(scene.frames) if f.period == p]
         lengths, errors, depths = [], [], {j: [] for j in mine}

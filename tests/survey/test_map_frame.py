@@ -65,7 +65,7 @@ def test_the_error_is_that_of_the_affine_map(scene):
     frames = [f if f.period else g for f, g in zip(wide.frames, scene.frames, strict=True)]
     wide = replace(wide, frames=tuple(frames))
     frame = map_frame(wide, None)
-    centres = camera_centre(np.stack([f.cam_from_world for f in wide.frames]))
+    centres = camera_centre(wide.frame_poses)
     off = np.linalg.norm(frame.to_map(centres) - exactly(centres, frame.crs), axis=1)
     assert frame.error == pytest.approx(off.max(), rel=1e-3)
     assert 0.1 < frame.error < 0.3  # the curvature of the earth: 1500^2 / 2 / 6.4e6

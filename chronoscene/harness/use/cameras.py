@@ -188,12 +188,11 @@ def _of_scene(run: TrainedRun, scene: Scene, split: str) -> CameraSequence:
 
 
 def _around(run: TrainedRun, scene: Scene, frames: int, shape: OrbitShape) -> CameraSequence:
-    poses = np.stack([frame.cam_from_world for frame in scene.frames])
     camera = run.photos(scene).camera(scene.frames[0])
     if shape.size is not None:
         width, height = shape.size  # with the same horizontal field of view
         camera = _centred(width, height, camera.K[0, 0] * width / camera.width)
-    points = scene.points.xyz
+    poses, points = scene.frame_poses, scene.points.xyz
     path = orbit(poses, points, frames, radius=shape.radius, height=shape.height)
     return CameraSequence(
         tuple(Viewpoint(_numbered(i), camera, p, None) for i, p in enumerate(path)), True

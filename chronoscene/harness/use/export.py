@@ -121,7 +121,7 @@ def make_file(
         prepared: Result of `prepare`.
         kind: Format, of `chronoscene.splat_files.SUFFIXES`.
     """
-    up = find_up(np.stack([frame.cam_from_world for frame in scene.frames]))
+    up = find_up(scene.frame_poses)
     data = splat_files.encode(kind, prepared.cloud, antialiased=prepared.antialiased, up=up)
     read = splat_files.decode(kind, data)
     in_training = read.transformed(run.training_from_local(prepared.offset))
@@ -150,8 +150,7 @@ def local_offset(scene: Scene) -> Array:
 
     It is the same for all periods: the median camera centre, in whole units.
     """
-    centres = camera_centre(np.stack([frame.cam_from_world for frame in scene.frames]))
-    median = np.round(np.median(centres, axis=0))
+    median = np.round(np.median(camera_centre(scene.frame_poses), axis=0))
     return median if np.abs(median).max() > FAR_AWAY else np.zeros(3)
 
 

@@ -46,8 +46,7 @@ class Content:
         scale = EXTENT / max(float(radius), 1e-9)
         self.view_from_world = Sim3(scale, np.eye(3), -scale * middle)
         """Transform to the frame of the browser, whose axes are those of the world."""
-        poses = np.stack([frame.cam_from_world for frame in scene.frames])
-        self.poses = self.view_from_world.apply_to_pose(poses)
+        self.poses = self.view_from_world.apply_to_pose(scene.frame_poses)
         """Cameras in the frame of the browser. [C, 4, 4]"""
 
     def start(self) -> tuple[Array, Array, Array]:

@@ -55,7 +55,7 @@ def placed_scene(scene: Scene) -> Placed:
     return Placed(
         names=[f.name for f in scene.frames],
         labels=[scene.periods[f.period].label for f in scene.frames],
-        cam_from_world=np.stack([f.cam_from_world for f in scene.frames]),
+        cam_from_world=scene.frame_poses,
         points=scene.points.xyz,
         colors=scene.points.rgb,
     )

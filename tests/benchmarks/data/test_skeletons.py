@@ -47,7 +47,7 @@ def test_images_and_points_are_those_asked_for(scene: Scene) -> None:
 def test_observations_are_projections(scene: Scene) -> None:
     points = scene.points
     of = np.repeat(np.arange(len(points)), np.diff(points.track_start))
-    poses = np.stack([f.cam_from_world for f in scene.frames])[points.track_frame]
+    poses = scene.frame_poses[points.track_frame]
     local = np.einsum("nij,nj->ni", poses[:, :3, :3], points.xyz[of]) + poses[:, :3, 3]
     assert local[:, 2].min() > 1
     K = scene.frames[0].camera.K

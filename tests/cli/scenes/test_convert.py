@@ -72,7 +72,7 @@ def test_coordinates_in_a_reference_system(make_scene_folder, tmp_path):
     scene = read_scene(folder)
     assert [r["image"] for r in rows] == [f.name for f in scene.frames]
     places = np.array([[float(r[c]) for c in "ENh"] for r in rows])
-    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    centres = camera_centre(scene.frame_poses)
     utm = read_reference_system("", "EPSG:32632")
     np.testing.assert_allclose(utm.to_local(frame, places), centres, atol=1e-3)
     assert (tmp_path / "out/points.ply").is_file()

@@ -145,8 +145,7 @@ def test_far_is_a_hundred_times_the_usual_distance(scene, times, far):
     scene.edit_fields(POINTS, 5, {2: "4e4"})  # medians do not depend on how far
     model = read_scene(scene.root)
     middle = np.median(model.points.xyz, axis=0)
-    centres = camera_centre(np.stack([f.cam_from_world for f in model.frames]))
-    usual = np.median(np.linalg.norm(centres - middle, axis=1))
+    usual = np.median(np.linalg.norm(camera_centre(model.frame_poses) - middle, axis=1))
     sideways = np.linalg.norm((model.points.xyz[5] - middle)[[0, 2]])
     y = middle[1] + np.sqrt((times * usual) ** 2 - sideways**2)
     scene.edit_fields(POINTS, 5, {2: f"{y:.17g}"})
