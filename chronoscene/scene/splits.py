@@ -15,6 +15,7 @@ from typing import Literal
 
 from chronoscene.errors import SceneError
 from chronoscene.scene import Scene, Split
+from chronoscene.scene.grouping import grouped
 
 SPLIT = "sparse/split.txt"  # Place of the period table in a scene folder
 
@@ -261,9 +262,7 @@ def assign_tests(
 
 def default_tests(periods: Mapping[str, int]) -> set[str]:
     """The default split: every 8th image of each period in name order, from the first on."""
-    by_period: dict[int, list[str]] = {}
-    for name in sorted(periods):
-        by_period.setdefault(periods[name], []).append(name)
+    by_period = grouped((periods[name], name) for name in sorted(periods))
     return {name for names in by_period.values() for name in names[::TEST_EVERY]}
 
 

@@ -23,6 +23,7 @@ from chronoscene.methods import (
     options_of,
 )
 from chronoscene.methods.options import Option
+from chronoscene.scene.grouping import grouped
 
 
 @click.command("methods")
@@ -112,9 +113,7 @@ def describe(spec: MethodSpec, runs: Path, *, everything: bool = True) -> Iterat
 
 def describe_option(option: Option) -> str:
     """Return name, default and values in presets of an option, and its meaning below."""
-    presets: dict[str, list[str]] = {}
-    for preset, value in option.presets.items():
-        presets.setdefault(as_typed(value), []).append(preset)
+    presets = grouped((as_typed(value), preset) for preset, value in option.presets.items())
     others = "".join(f"; {', '.join(names)}: {value}" for value, names in presets.items())
     text = click.wrap_text(option.meaning or "(no description)", width=80, initial_indent="")
     return f"{option.name}={as_typed(option.default)}{others}\n{indent(text, '    ')}"

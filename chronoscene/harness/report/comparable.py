@@ -18,6 +18,7 @@ from typing import NamedTuple
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import RunRecord, variant_options
 from chronoscene.io.wording import shown
+from chronoscene.scene.grouping import grouped
 
 KEY = (
     *("scene", "scene_hash", "split_hash", "method", "strategy", "preset", "variant"),
@@ -78,10 +79,7 @@ def budget_of(run: RunRecord) -> float | None:
 
 def comparable(runs: Iterable[RunRecord]) -> dict[Setting, list[RunRecord]]:
     """Group runs by their setting, those of a scene side by side."""
-    groups: dict[Setting, list[RunRecord]] = {}
-    for run in runs:
-        groups.setdefault(setting_of(run), []).append(run)
-    return dict(sorted(groups.items()))
+    return dict(sorted(grouped((setting_of(run), run) for run in runs).items()))
 
 
 def apart(records: Sequence[RunRecord]) -> list[RunRecord]:

@@ -22,6 +22,7 @@ from chronoscene.io.wording import shown
 from chronoscene.methods import Method, Prediction, StepReport
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame
+from chronoscene.scene.grouping import grouped
 
 PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 """Shares of the training at which the probe views are rendered."""
@@ -121,9 +122,7 @@ def seed_everything(seed: int) -> None:
 
 def probe_frames(part: Part) -> tuple[Frame, ...]:
     """Return the probe views of a model: the middle test view of each period, in name order."""
-    by_period: dict[int, list[Frame]] = {}
-    for frame in part.test:
-        by_period.setdefault(frame.period, []).append(frame)
+    by_period = grouped((frame.period, frame) for frame in part.test)
     return tuple(frames[len(frames) // 2] for _, frames in sorted(by_period.items()))
 
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from chronoscene.registration.context import Calibration
 from chronoscene.registration.photos.photo import Capture
-from chronoscene.scene import Frame, Scene
+from chronoscene.scene import Scene
+from chronoscene.scene.grouping import grouped
 
 MIN_PHOTOS = 20
 """Photos from which on a camera is calibrated for each date alone. Lenses are refocused and dropped
@@ -25,9 +26,7 @@ SAME_VISIT = timedelta(days=1)
 
 def scene_groups(scene: Scene) -> list[dict[str, Any]]:
     """Group the images of a scene by camera, for `extraction.extract`."""
-    by_camera: dict[int, list[Frame]] = {}
-    for frame in scene.frames:
-        by_camera.setdefault(frame.camera.camera_id, []).append(frame)
+    by_camera = grouped((frame.camera.camera_id, frame) for frame in scene.frames)
     return [
         {
             "names": sorted(f.name for f in frames),
@@ -47,9 +46,7 @@ def camera_groups(
     visits do not, where each has enough of them (`MIN_PHOTOS`). Initial focal lengths are
     left to COLMAP, which knows the sensors of many cameras.
     """
-    by_lens: dict[tuple[Any, ...], list[Capture]] = {}
-    for capture in captures:
-        by_lens.setdefault(_lens(capture), []).append(capture)
+    by_lens = grouped((_lens(capture), capture) for capture in captures)
     groups = [g for members in by_lens.values() for g in _SPLITTERS[calibration](members)]
     return [
         {"names": sorted(names), "model": FEW if model == AUTO else model, "params": None}
@@ -63,9 +60,7 @@ def _lens(capture: Capture) -> tuple[Any, ...]:
 
 
 def _periods(captures: Sequence[Capture]) -> list[list[Capture]]:
-    by_period: dict[int, list[Capture]] = {}
-    for capture in captures:
-        by_period.setdefault(capture.period, []).append(capture)
+    by_period = grouped((capture.period, capture) for capture in captures)
     return [by_period[p] for p in sorted(by_period)]
 
 

@@ -20,6 +20,7 @@ from chronoscene.images.exif import read_exif, taken_at
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.photo import Capture, open_photo
+from chronoscene.scene.grouping import grouped
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 PERIOD_GAP_DAYS = 14  # In one folder of photos, a gap of so many days begins a new period
@@ -389,9 +390,7 @@ def _days_from(day: date, span: tuple[date, date] | None) -> int:
 
 def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
     """Sort labels by the dates of their photos if all have one, else in natural order."""
-    by_label: dict[str, list[Path]] = {}
-    for item in listed:
-        by_label.setdefault(item.label, []).append(item.path)
+    by_label = grouped((item.label, item.path) for item in listed)
     first: dict[str, datetime] = {}
     for label, paths in by_label.items():
         times = [t for p in paths if (t := taken_at(p, read_exif(p))) is not None]

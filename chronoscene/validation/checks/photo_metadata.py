@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.geodesy import Georeference, median_longitude
+from chronoscene.scene.grouping import grouped
 from chronoscene.scene.similarity import SIGMA, Similarity, fit_robustly
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.scene_folder import RawScene, derived
 
 MIN_DATES = 3  # Photos with a date from which the median date of a period is meaningful

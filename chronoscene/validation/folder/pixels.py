@@ -21,7 +21,7 @@ from chronoscene.errors import ImageError
 from chronoscene.images.decoding import is_covered, is_transparent, load_rgb, stored_size
 from chronoscene.images.exif import ExifData, exif_of
 from chronoscene.io.staging import sha256_of
-from chronoscene.validation.folder.grouping import grouped
+from chronoscene.scene.grouping import grouped
 
 T = TypeVar("T")
 Track = Callable[[Sequence[T], str], Iterable[T]]

@@ -28,10 +28,10 @@ from chronoscene.images.masks import MASKS, mask_name, mask_place
 from chronoscene.io.documents import decode_text
 from chronoscene.scene import Camera, Period, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.scene.grouping import grouped
 from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
 from chronoscene.scene.tracks import seen_by_period
 from chronoscene.validation.folder import observations, pixels
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.names import is_safe
 from chronoscene.validation.folder.observations import Observations, Reprojection
 from chronoscene.validation.folder.pixels import Header, Pixels, Track

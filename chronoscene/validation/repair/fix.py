@@ -18,8 +18,8 @@ from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
+from chronoscene.scene.grouping import grouped
 from chronoscene.scene.splits import parse_test_text
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.names import spelling
 from chronoscene.validation.folder.pixels import read_headers
 from chronoscene.validation.folder.scene_folder import RawScene, TextFile, read_text_file

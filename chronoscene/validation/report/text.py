@@ -9,8 +9,8 @@ from itertools import groupby
 import click
 
 from chronoscene.io.wording import counted
+from chronoscene.scene.grouping import grouped
 from chronoscene.validation import rule
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.report.rule_list import COLOURS
 from chronoscene.validation.rule import SEVERITIES, Finding, SceneReport, Summary, is_valid
 

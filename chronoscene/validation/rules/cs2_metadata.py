@@ -12,10 +12,10 @@ import numpy as np
 
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.formats.chronoscene import PERIODS
+from chronoscene.scene.grouping import grouped
 from chronoscene.validation import rule
 from chronoscene.validation.checks import photo_metadata
 from chronoscene.validation.checks.photo_metadata import GpsFit, dates_of, of_other_period
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
 

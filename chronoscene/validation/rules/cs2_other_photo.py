@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array
 from chronoscene.io.wording import quote, shown
+from chronoscene.scene.grouping import grouped
 from chronoscene.validation import rule
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.pixels import Pixels
 from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit

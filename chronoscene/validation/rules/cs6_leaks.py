@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import shown
 from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.scene.grouping import grouped
 from chronoscene.validation import rule
 from chronoscene.validation.checks.reprojection import typical_depth
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.pixels import Pixels
 from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import Hit

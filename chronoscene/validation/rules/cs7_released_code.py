@@ -12,9 +12,9 @@ from pathlib import PurePosixPath
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
+from chronoscene.scene.grouping import grouped
 from chronoscene.scene.splits import TEST_EVERY
 from chronoscene.validation import rule
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.pixels import Header
 from chronoscene.validation.folder.scene_folder import RawScene, TextFile
 from chronoscene.validation.rule import Hit

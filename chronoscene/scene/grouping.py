@@ -1,4 +1,4 @@
-"""Values by key."""
+"""Grouping of values by a key, such as frames by their period."""
 
 from collections.abc import Hashable, Iterable
 from typing import TypeVar
