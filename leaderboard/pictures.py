@@ -26,7 +26,8 @@ def find_runs(folders: Iterable[Path], standings: Iterable[Standing]) -> dict[Pa
     wanted = {frozenset(s.entry.runs[0].images.items()): s for s in standings}
     found = {}
     for run in (run for folder in folders for run in run_folders(folder)):
-        hashes = frozenset((image.view, image.sha256) for image in _own(run / PREDICTIONS))
+        own = read_manifest(run / PREDICTIONS).own_images
+        hashes = frozenset((image.view, image.sha256) for image in own)
         if (known := wanted.get(hashes)) is not None:
             record, entered = read_run(run), known.records[0]
             if (entered.scene_hash, entered.config_hash) == (record.scene_hash, record.config_hash):
@@ -53,7 +54,7 @@ def gallery(runs: Mapping[Path, str], folder: Path, place: str) -> dict[str, Any
     record = read_run(first)
     truth = ground_truth_folder(first.parents[2], record.scene)
     photos = {image.view: image for image in read_manifest(truth).images}
-    images = {run: {i.view: i for i in _own(run / PREDICTIONS)} for run in runs}
+    images = {run: {i.view: i for i in read_manifest(run / PREDICTIONS).own_images} for run in runs}
     periods = sorted(map(int, record.periods))
     folder.mkdir(parents=True)
 
@@ -86,9 +87,3 @@ def gallery(runs: Mapping[Path, str], folder: Path, place: str) -> dict[str, Any
         "periods": [record.period_labels[str(period)] for period in periods],
         "views": views,
     }
-
-
-def _own(predictions: Path) -> list[ImageEntry]:
-    """List the images of the period in which their camera stood."""
-    images = read_manifest(predictions).images
-    return [i for i in images if i.rendered_period == i.camera_period]

@@ -80,15 +80,14 @@ def submit(folders: Iterable[Path], to: Path) -> list[Path]:
 def _copy_predictions(source: Path, place: Path) -> None:
     """Copy the images of the periods of their photos, with their manifest, in place of others."""
     manifest = read_manifest(source)
-    images = tuple(i for i in manifest.images if i.rendered_period == i.camera_period)
     partial = place.with_name(partial_name(place.name))
     try:
         with needing_space(place):
-            for image in images:
+            for image in manifest.own_images:
                 target = partial / image.file
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(source / image.file, target)
-            write_manifest(partial, manifest.model_copy(update={"images": images}))
+            write_manifest(partial, manifest.model_copy(update={"images": manifest.own_images}))
         shutil.rmtree(place, ignore_errors=True)
         partial.rename(place)
     finally:
@@ -114,7 +113,7 @@ def entry_run(folder: Path) -> EntryRun:
     for row in read_rows(folder):
         if row.region == ALL and row.rendered_period == row.camera_period:
             values.setdefault(row.view, {})[row.metric] = row.value
-    images = {i.view: i for i in manifest.images if i.rendered_period == i.camera_period}
+    images = {i.view: i for i in manifest.own_images}
     if not values.keys() <= images.keys():
         raise refused(folder, "other views in its rows than among its predictions")
     try:

@@ -81,6 +81,11 @@ class Manifest(BaseModel):
     """Evaluation size and the like."""
     images: tuple[ImageEntry, ...]
 
+    @property
+    def own_images(self) -> tuple[ImageEntry, ...]:
+        """Images that show the period of their photo."""
+        return tuple(i for i in self.images if i.rendered_period == i.camera_period)
+
     @model_validator(mode="after")
     def _of_distinct_views(self) -> Self:
         views = {(e.view, e.rendered_period) for e in self.images}

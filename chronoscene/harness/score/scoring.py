@@ -184,7 +184,7 @@ def match_views(
     """
     if predicted.scene_hash != truth.scene_hash:
         raise _mismatch(folder, f"scene {truth.scene_hash[:12]}", predicted.scene_hash[:12])
-    by_view = {e.view: e for e in predicted.images if stage or e.rendered_period == e.camera_period}
+    by_view = {e.view: e for e in (predicted.images if stage else predicted.own_images)}
     targets = {e.view: e for e in truth.images if not stage or e.view in by_view}
     if missing := sorted(targets.keys() ^ by_view.keys()):
         raise _mismatch(folder, "one prediction per test view", f"a difference at {missing[0]!r}")
