@@ -226,19 +226,23 @@ def _write_photos(
     All photos have a mask or none has, as some programs want it.
     """
     folder.mkdir()
+    files = {frame.name: folder / f"{i:05d}.mask.png" for i, frame in enumerate(frames)}
     masks: dict[str, Path] = {}
-    any_masked = False
     for i, frame in enumerate(frames):
-        size = store.camera(frame).size[::-1]
-        pixels, mask = np.zeros((*size, 3), np.uint8), None
+        pixels, mask = np.zeros((*store.camera(frame).size[::-1], 3), np.uint8), None
         if frame.name in trained:
             pixels, mask = store.load(frame), store.load_mask(frame)
-        any_masked |= mask is not None
         (folder / f"{i:05d}.png").write_bytes(encode_png(pixels))
-        masks[frame.name] = folder / f"{i:05d}.mask.png"
-        whole = np.ones(size, bool) if mask is None else mask
-        masks[frame.name].write_bytes(encode_png(to_grey(whole)))
-    return masks if any_masked else {}
+        if mask is not None:
+            masks[frame.name] = files[frame.name]
+            files[frame.name].write_bytes(encode_png(to_grey(mask)))
+    if not masks:
+        return {}
+    for frame in frames:
+        if frame.name not in masks:
+            whole = np.ones(store.camera(frame).size[::-1], bool)
+            files[frame.name].write_bytes(encode_png(to_grey(whole)))
+    return files
 
 
 def _find_images(
