@@ -186,27 +186,24 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]
         yield from _check("focal_gap", pair.focal_gap, place)
     if isinstance(pair.surfaces, SurfaceDistance):
         shift = pair.surfaces.shift
-        shifted = shift.low > 0
-        against = list(
-            _check("clouds", 100 * shift.value / certificate.extent if shifted else 0.0, place)
-        )
-        yield from against or _contradiction(certificate, pair, place, shifted)
+        moved = 100 * shift.value / certificate.extent if shift.low > 0 else 0.0
+        against = list(_check("clouds", moved, place))
+        yield from against or _contradiction(certificate, pair, place)
         yield from _check("open", 100 * shift.high / certificate.extent, place)
         yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
-def _contradiction(
-    certificate: Certificate, pair: PairFigures, place: str, shifted: bool
-) -> Iterator[Objection]:
+def _contradiction(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
     """Judge surfaces that contradict the matches, but not by a shift beyond the limit.
 
     Patches of real surfaces are surer than they are right, and err most in their turn. So the
-    contradiction counts only where they are `shifted`, or by themselves find the periods displaced
+    contradiction counts only where they are shifted, or by themselves find the periods displaced
     beyond the limit; forward-facing captures leave their depths open, so the latter says nothing
     there.
     """
-    if not _contradicted(pair):
+    if isinstance(pair.surfaces, str) or not _contradicted(pair):
         return
+    shifted = pair.surfaces.shift.low > 0
     alone = _of_limits(certificate, pair.by_surfaces)
     displaced = bool(alone) and alone[1].value > 1 and not certificate.facing
     if shifted or displaced:

@@ -44,8 +44,8 @@ def with_full_lens(
     before = _error(model)
     free = replace(task, held=False)
     for attempt in (free, task) if task.held else (free,):
-        found = _adjusted(model, attempt, many) if _may_gain(model, attempt, many) else model
-        if _error(found) > (1 - MIN_GAIN) * before:
+        found = _adjusted(model, attempt, many) if _may_gain(model, attempt, many) else None
+        if found is None or _error(found) > (1 - MIN_GAIN) * before:
             task.remarks.append("more coefficients of the lens gain nothing")
             return model
         stated = stated_focals(found, focals)
