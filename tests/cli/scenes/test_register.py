@@ -181,23 +181,27 @@ def test_the_reference_system_is_checked_before_any_work(
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
 
 
-def test_axes_of_control_are_checked_before_any_work(tmp_path: Path) -> None:
-    """Coordinates of the output are called east and north."""
+@pytest.mark.parametrize(
+    ("text", "error", "found", "todo"),
+    [
+        # Coordinates of the output are called east and north.
+        ("# crs: EPSG:5513\np,0.jpg,1,2,1040000,730000,300\n", ConfigError, "south and west", ""),
+        (
+            "point,image,x,y,X,Y,Z\np,,,,1,2,3\nq,,,,4,5,6\n",
+            SceneError, "without a click", "chronoscene mark",
+        ),
+    ],
+    ids=["axes", "no click"],
+)  # fmt: skip
+def test_control_is_checked_before_any_work(
+    tmp_path: Path, text: str, error: type[ChronoSceneError], found: str, todo: str
+) -> None:
     file = tmp_path / "gcp.csv"
-    file.write_text("# crs: EPSG:5513\np,0.jpg,1,2,1040000,730000,300\n")
+    file.write_text(text)
     done = call(photos(tmp_path / "in/a", 3).parent, tmp_path / "out", "--tie-points", file)
-    assert isinstance(done.exception, ConfigError), done.output
-    assert done.exception.place == str(file) and "south and west" in done.exception.found
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["gcp.csv", "in"]
-
-
-def test_coordinates_without_a_click_are_refused_before_any_work(tmp_path: Path) -> None:
-    file = tmp_path / "gcp.csv"
-    file.write_text("point,image,x,y,X,Y,Z\np,,,,1,2,3\nq,,,,4,5,6\n")
-    done = call(photos(tmp_path / "in/a", 3).parent, tmp_path / "out", "--tie-points", file)
-    assert isinstance(done.exception, SceneError), done.output
-    assert done.exception.place == str(file) and "without a click" in done.exception.found
-    assert "chronoscene mark" in done.exception.todo
+    assert isinstance(done.exception, error), done.output
+    assert done.exception.place == str(file) and found in done.exception.found
+    assert todo in done.exception.todo
     assert sorted(p.name for p in tmp_path.iterdir()) == ["gcp.csv", "in"]
 
 
