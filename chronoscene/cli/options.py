@@ -88,15 +88,23 @@ def refuse_options(names: Iterable[str], condition: str) -> None:
         ConfigError: If one was typed.
     """
     context = click.get_current_context()
-    flags = {parameter.name: parameter.opts[0] for parameter in context.command.params}
-    for name in names:
-        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise ConfigError(
-                flags[name],
-                expected=f"no such option {condition}",
-                found="one",
-                todo="leave it out",
-            )
+    wanted = set(names)
+    typed = [
+        parameter
+        for parameter in context.command.params
+        if parameter.name in wanted
+        and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
+    ]
+    if not typed:
+        return
+    number = len(typed)
+    kind = "option" if any(p.param_type_name == "option" for p in typed) else "argument"
+    raise ConfigError(
+        ", ".join(parameter.opts[0] for parameter in typed),
+        expected=f"no such {kind}{'' if number == 1 else 's'} {condition}",
+        found="one" if number == 1 else str(number),
+        todo="leave it out" if number == 1 else "leave them out",
+    )
 
 
 def split_list(option: str, text: str) -> tuple[str, ...]:

@@ -1,11 +1,14 @@
 """Options that several commands share."""
 
+import re
+
 import click
 import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import COMMANDS, cli
-from chronoscene.cli.options import FiniteFloat
+from chronoscene.cli.options import FiniteFloat, refuse_options
+from chronoscene.errors import ConfigError
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
@@ -26,3 +29,25 @@ def test_ranges_of_numbers_are_finite():
     types = [option.type for command in commands for option in command.params]
     ranges = [each for each in types if isinstance(each, click.FloatRange)]
     assert len(ranges) > 10 and all(isinstance(each, FiniteFloat) for each in ranges)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--fps", "5"], "--fps: expected no such option without a film, found one; leave it out"),
+        (["a"], "place: expected no such argument without a film, found one; leave it out"),
+        (["--fps", "5", "--codec", "x"], "--codec, --fps: .* options .*, found 2; leave them out"),
+        (["a", "--fps", "5"], "place, --fps: expected no such options without a film, found 2;"),
+    ],
+)
+def test_options_without_an_effect_are_refused_by_name(arguments, message):
+    @click.command()
+    @click.argument("place", required=False)
+    @click.option("--codec", default="y")
+    @click.option("--fps")
+    def command(**_options: str) -> None:
+        refuse_options(("fps", "codec", "place"), "without a film")
+
+    assert CliRunner().invoke(command, []).exit_code == 0
+    refused = CliRunner().invoke(command, arguments).exception
+    assert isinstance(refused, ConfigError) and re.match(message, str(refused))

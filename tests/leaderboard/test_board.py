@@ -100,7 +100,5 @@ def test_values_of_other_views_than_those_that_count_are_refused(
 def test_options_of_reading_need_a_scene(project, tmp_path):
     site = (tmp_path / "entries", "--out", tmp_path / "site")
     done = run_command("leaderboard", *site, "--period-by", "year")
-    assert (
-        done.exit_code == 2
-        and "--period-by: expected no such option without --verify" in done.stderr
-    )
+    assert done.exit_code == 2
+    assert "--period-by: expected no such option without --verify" in done.stderr

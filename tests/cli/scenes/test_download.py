@@ -81,14 +81,8 @@ def test_other_hosts_are_for_people():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["5pointz", "--out", "data"],
-            "--out: expected no such option with 5pointz, which only people can",
-        ),
-        (
-            ["5pointz", "wall"],
-            "scenes: expected no such option with 5pointz, which only people can",
-        ),
+        (["5pointz", "--out", "data"], "--out: expected no such option with 5pointz, which only"),
+        (["5pointz", "wall"], "scenes: expected no such argument with 5pointz, which only"),
         (["--out", "data"], "--out: expected no such option without NAME"),
     ],
 )

@@ -84,10 +84,7 @@ def test_methods_without_geometry_of_their_own_refuse_another_light(runs, traine
         (("--period", "0:0.5"), "period 0.5: expected a whole number: 4DGS under strategy sep"),
         (("--cameras", "orbit"), "--period: expected a period"),
         (("--radius", 3), "--size, --radius, --height: expected --cameras orbit"),
-        (
-            ("--frames", 5),
-            "--frames: expected no such option where cameras and periods give the number",
-        ),
+        (("--frames", 5), "--frames: expected no such option where cameras and periods give"),
         (("--fps", 5), "--fps: expected no such option for a folder of pictures"),
     ],
 )
