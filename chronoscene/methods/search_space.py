@@ -27,7 +27,8 @@ def starting_point(spec: MethodSpec, config: MethodConfig) -> dict[str, Any]:
             f"tune {spec.name}",
             expected="a method with a search space",
             found="none",
-            todo="add one to its MethodSpec: docs/guides/adding-a-method.md",
+            todo='add a search to its MethodSpec, such as search={"OPTION": Range(LOW, HIGH)}: '
+            "docs/guides/adding-a-method.md",
         )
     options = dataclasses.asdict(config)
     point = {}

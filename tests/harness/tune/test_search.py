@@ -204,7 +204,8 @@ def test_another_search_in_the_same_folder_is_refused(search, scene_folder, tmp_
 
 
 def test_what_is_missing_is_said(search, monkeypatch):
-    with pytest.raises(ConfigError, match="a method with a search space, found none"):
+    advice = r'space, found none; add a search to its MethodSpec, such as search={"OPTION": Range\('
+    with pytest.raises(ConfigError, match=advice):
         search("out", method="toy_methods:MEAN")
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(ConfigError, match=r"the package optuna.*install 'chronoscene"):
