@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib
 import sys
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-from chronoscene.checks import check_choice
+from chronoscene.checks import check_choice, nearest
 from chronoscene.errors import ConfigError
 
 PeriodInput = Literal["none", "label", "continuous"]
@@ -135,17 +136,44 @@ class MethodSpec:
 
 
 def import_object(reference: str) -> Any:
-    """Import ``module:Name``."""
-    module, _, name = reference.partition(":")
+    """Import ``module:Name``.
+
+    Raises:
+        ConfigError: If there is no such module, its import fails, or it has no such name.
+    """
+    place, _, name = reference.partition(":")
     try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        module = importlib.import_module(place)
+    except Exception as error:  # whatever the code of others raises
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if not place or place[0] == "." or f"{place}.".startswith(f"{missing}."):
+            raise ConfigError(
+                reference,
+                expected="an importable module:Name",
+                found=str(error),
+                todo="check the spelling, and that its package is installed",
+            ) from error
         raise ConfigError(
             reference,
-            expected="an importable module:Name",
-            found=f"{type(error).__name__}: {error}",
-            todo="check the spelling, and that its package is installed",
+            expected="a module that can be imported",
+            found=f"{type(error).__name__}: {error}{_line_of(error)}",
+            todo=f"correct {place}, or install what it needs",
         ) from error
+    try:
+        return getattr(module, name)
+    except AttributeError as error:
+        raise ConfigError(
+            reference,
+            expected=f"a name in the module {place}",
+            found=f"none called {name!r}",
+            todo=nearest(name, dir(module), otherwise="define it there, or check the spelling"),
+        ) from error
+
+
+def _line_of(error: Exception) -> str:
+    """Return the line that raised an error, in parentheses; nothing if there is no file."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return "" if frame.filename.startswith("<") else f" ({frame.filename}:{frame.lineno})"
 
 
 def method_names(group: str = ENTRY_POINT_GROUP) -> tuple[str, ...]:

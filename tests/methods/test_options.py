@@ -114,10 +114,36 @@ def test_unknown_preset_and_key_name_the_known_ones():
 def test_unknown_method_names_the_known_ones():
     with pytest.raises(ConfigError, match="chronogs"):
         load_spec("chronosg")
-    with pytest.raises(ConfigError, match="importable"):
-        load_spec("no.such.module:SPEC")
     with pytest.raises(ConfigError, match="expected a MethodSpec"):
         load_spec("json:dumps")
+
+
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [
+        ("no.such:SPEC", "expected an importable module:Name, found No module named 'no'; check"),
+        ("whole.part:SPEC", "importable module:Name, found No module named 'whole.part'; 'whole'"),
+        (":SPEC", "expected an importable module:Name, found Empty module name; check"),
+        (".whole:SPEC", "expected an importable module:Name, found the 'package' argument"),
+        ("whole:SPECS", "expected a name in the module whole, found none called 'SPECS'; did you"),
+        ("whole:", "expected a name in the module whole, found none called ''; define it there"),
+        ("needy:SPEC", r"found ModuleNotFoundError: No .* 'no' \(.*needy.py:2\); correct"),
+        ("broken:SPEC", r"imported, found NameError: name .* \(.*broken.py:1\); correct bro"),
+        ("unread:SPEC", r"imported, found SyntaxError: .* \(unread.py, line 1\); correct unread"),
+    ],
+)
+def test_an_import_that_fails_names_its_cause(reference, message, tmp_path, monkeypatch):
+    for name, text in (
+        ("whole", "SPEC = 1"),
+        ("needy", "\nimport no.such"),
+        ("broken", "SPEC = other"),
+        ("unread", "SPEC ="),
+    ):
+        (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "whole", raising=False)
+    with pytest.raises(ConfigError, match=f"^{reference}: .*{message}"):
+        load_spec(reference)
 
 
 @pytest.mark.parametrize(
