@@ -74,6 +74,8 @@ class _Listed:
     path: Path
     name: str
     label: str
+    row: str = ""
+    """File name and line of the table that names it; empty without a table."""
 
 
 def find_captures(path: Path, table: Path | None) -> tuple[Path, Path | None]:
@@ -217,7 +219,7 @@ def _from_table(root: Path, table: Path) -> list[_Listed]:
                 found=f"{listed[name].label!r} and {label!r}",
                 todo="keep one of the two lines",
             )
-        listed[name] = _Listed(file, PurePosixPath(name).as_posix(), label)
+        listed[name] = _Listed(file, PurePosixPath(name).as_posix(), label, Path(place).name)
     return list(listed.values())
 
 
@@ -282,7 +284,8 @@ def _assemble(
         opened = list(pool.map(open_photo, paths, names, numbers))
     for item, period, capture in zip(listed, numbers, opened, strict=True):
         if isinstance(capture, str):
-            refused.append((item.name, period, capture))
+            reason = f"{item.row}: {capture}" if item.row else capture
+            refused.append((item.name, period, reason))
         else:
             images.append(capture)
     if not images:

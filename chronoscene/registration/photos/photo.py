@@ -75,6 +75,8 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
             image.load()
             small = image.convert("L").resize((LOOK_SIDE, LOOK_SIDE), Image.Resampling.BOX)
             look = small.tobytes()
+    except FileNotFoundError:
+        return "the file is missing"
     except Exception as error:  # Pillow raises almost anything for damaged files
         return f"cannot be decoded: {str(error) or type(error).__name__}"
     if min(width, height) < MIN_SIDE:

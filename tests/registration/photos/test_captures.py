@@ -170,6 +170,19 @@ def test_wrong_tables_are_refused(tmp_path: Path, text: str, place: str, found: 
     assert found in caught.value.found
 
 
+def test_missing_and_unusable_photos_of_a_table_are_named_with_their_rows(tmp_path: Path) -> None:
+    photo(tmp_path / "a.jpg")
+    (tmp_path / "text.jpg").write_text("no photo")
+    table = tmp_path / "t.csv"
+    table.write_text("image,period\na.jpg,0\n\nsub/b.jpg,0\ntext.jpg,0\n")
+    missing, text = read_captures(tmp_path, table=table).refused
+    assert missing == ("sub/b.jpg", 0, "t.csv:4: the file is missing")
+    assert text[2].startswith("t.csv:5: cannot be decoded: ")
+    table.write_text("image,period\nb.jpg,0\n")
+    with pytest.raises(SceneError, match=r"1 files, none usable \(t.csv:2: the file is missing\)"):
+        read_captures(tmp_path, table=table)
+
+
 def test_unusable_photos_are_named_with_reasons(tmp_path: Path) -> None:
     photo(tmp_path / "0" / "good.jpg")
     photo(tmp_path / "1" / "good.jpg")
