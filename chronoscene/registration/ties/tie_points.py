@@ -41,6 +41,7 @@ COLUMNS = {
 column can be the pixels."""
 
 _TODO_CSV = "write lines such as: corner1,2016/IMG_0001.jpg,812.5,334.0"
+_TODO_SEPARATORS = "separate the fields by commas, and write decimals with a point"
 _TODO_ODM = "write lines such as: 544256.7 5320919.9 5.0 3044.5 2622.0 IMG_0525.jpg gcp01"
 
 
@@ -236,11 +237,12 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
         if any(row[width:]):
             raise _wrong(
                 path, number, f"{width} fields", f"{len(row)}",
-                "write decimal points instead of commas",
+                _TODO_SEPARATORS,
             )  # fmt: skip
         if len(row) <= max(order[name] for name in ("point", "image", "x", "y")):
             found = f"{len(row)} fields"
-            raise _wrong(path, number, "point id, image, x, y", found, _TODO_CSV)
+            todo = _TODO_SEPARATORS if ";" in "".join(row) else _TODO_CSV
+            raise _wrong(path, number, "point id, image, x, y", found, todo)
         point, image = row[order["point"]], row[order["image"]]
         cell = {name: row[i] for name, i in order.items() if i < len(row)}
         world = _three(path, number, cell, "world", "world coordinates")
@@ -301,7 +303,8 @@ def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | Non
     if missing:
         raise _wrong(
             path, number, "a header with point, image, x, y, or a line of data",
-            f"no {', '.join(missing)} in {','.join(row)[:80]!r}", _TODO_CSV,
+            f"no {', '.join(missing)} in {','.join(row)[:80]!r}",
+            _TODO_SEPARATORS if ";" in "".join(row) else _TODO_CSV,
         )  # fmt: skip
     return order
 
@@ -380,7 +383,8 @@ def _names_of(image: str, names: Sequence[str]) -> list[str]:
 
 def _number(path: Path, line: int, text: str, what: str) -> float:
     if not _is_number(text):
-        raise _wrong(path, line, f"a number for {what}", repr(text[:40]), "correct the line")
+        todo = "write decimals with a point" if "," in text else "correct the line"
+        raise _wrong(path, line, f"a number for {what}", repr(text[:40]), todo)
     return float(text)
 
 
