@@ -7,13 +7,14 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.options import EXISTING_FILE, PATH, TABLE, FiniteRange, refuse_options
-from chronoscene.cli.output import check_file, emit
+from chronoscene.cli.output import check_file, emit, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.geodesy import read_reference_system
 from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.wording import counted
 from chronoscene.registration.photos.captures import photo_folders, read_captures
-from chronoscene.registration.report.marking import marking_page
+from chronoscene.registration.report.marking import clicks_elsewhere, marking_page
 from chronoscene.registration.ties.tie_points import read_tie_points
 
 
@@ -75,4 +76,9 @@ def command(
             found, points=points, model=model, max_size=max_size, title=page.stem, report=report
         )
     write_text_atomic(page, text)
+    if points is not None and (others := clicks_elsewhere(points, found)):
+        say(
+            f"note: {counted(len(others), 'click')} in photos that are not in CAPTURES, such as "
+            f"{others[0].image!r}: the page does not show them, but saves them with the others"
+        )
     emit(f"{page}: {len(found)} photos, {len(text) / 1e6:.1f} MB; open it in a browser\n")

@@ -19,7 +19,7 @@ from chronoscene.io.pages import data_uri, render_page
 from chronoscene.io.processes import Report
 from chronoscene.registration.photos.inputs import plain_names
 from chronoscene.registration.photos.photo import Capture
-from chronoscene.registration.ties.tie_points import TiePoints, match_images
+from chronoscene.registration.ties.tie_points import Click, TiePoints, match_images
 from chronoscene.scene.cameras import CAMERA_MODELS, PINHOLE_MODELS, POLYNOMIAL_MODELS
 from chronoscene.scene.geometry import camera_centre
 
@@ -45,7 +45,7 @@ def marking_page(
 
     Args:
         captures: The photos.
-        points: Points to start with; clicks in other photos are dropped.
+        points: Points to start with; clicks in other photos are saved with them, and not shown.
         model: Folder of a COLMAP model of these photos, by which places are predicted.
         max_size: Pixels of the longer side of an embedded photo.
         title: Of the page.
@@ -107,10 +107,18 @@ def _points(points: TiePoints, names: Sequence[str]) -> list[dict[str, Any]]:
             "role": p.role,
             "world": "" if p.world is None else " ".join(map(repr, p.world)),
             "sigma": "" if p.sigma is None else " ".join(map(repr, p.sigma)),
-            "marks": {names[i]: [c.x, c.y] for c in p.clicks if (i := index[c.image]) is not None},
+            "marks": {
+                c.image if (i := index[c.image]) is None else names[i]: [c.x, c.y] for c in p.clicks
+            },
         }
         for p in points.points
     ]
+
+
+def clicks_elsewhere(points: TiePoints, captures: Sequence[Capture]) -> list[Click]:
+    """Return the clicks in photos that a page of the captures does not show."""
+    index = match_images(points, [c.name for c in captures])
+    return [c for p in points.points for c in p.clicks if index[c.image] is None]
 
 
 def _depths(model: Model) -> tuple[float, float]:

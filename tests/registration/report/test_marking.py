@@ -97,6 +97,20 @@ def test_the_command_writes_a_page(captures: Path, tmp_path: Path) -> None:
     assert (tmp_path / "p.html").stat().st_size > 10_000
 
 
+def test_clicks_in_other_photos_are_named_and_kept(captures: Path, tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    points = tmp_path / "points.csv"
+    points.write_text(f"p,{NAMES[0]},10,20\np,2024/far.jpg,30,40\nq,b.jpg,5,6\n")
+    words = [captures, tmp_path / "p.html", "--tie-points", points, "--tie-scale", 0.5]
+    done = CliRunner().invoke(command, list(map(str, words)))
+    assert done.exit_code == 0, done.output
+    assert "2 clicks in photos that are not in CAPTURES, such as '2024/far.jpg'" in done.stderr
+    marks = re.findall(r'"marks": \{(.*?)\}', (tmp_path / "p.html").read_text())
+    ours = f'"{NAMES[0]}": [5.0, 10.0]'
+    assert marks == [f'{ours}, "2024/far.jpg": [15.0, 20.0]', '"b.jpg": [2.5, 3.0]']
+
+
 def test_a_page_that_cannot_be_written_is_refused_before_the_photos_are_read(
     captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
