@@ -16,7 +16,7 @@ from chronoscene.harness.files.records import PHOTOS
 from chronoscene.harness.plan.settings import RunSettings
 from chronoscene.images.disk_cache import DiskCache, files_of
 from chronoscene.images.store import ImageStore, decoded_bytes, evaluation_size
-from chronoscene.io.wording import counted
+from chronoscene.io.wording import counted, in_words
 from chronoscene.kernels.runtime import available_threads, machine_memory, views_for_threads
 from chronoscene.methods import MethodConfig, MethodSpec, has_function, make_method
 from chronoscene.scene import Scene
@@ -226,4 +226,5 @@ def _check_disk(runs: Path, needs: PhotoNeeds, images: int) -> None:
 
 
 def _gb(size: int) -> str:
-    return f"{size / 1e9:.2f} GB"
+    """Format a size in GB; less than 0.01 GB in MB or kB."""
+    return f"{size / 1e9:.2f} GB" if size >= 10**7 else in_words(size)

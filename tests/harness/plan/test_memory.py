@@ -87,10 +87,10 @@ def test_half_of_the_threads_decode_if_memory_allows_it(make_scene, settings):
 def test_the_line_says_what_is_taken(make_scene, settings, free):
     free(2 * 10**9, 10**9)
     line = room(make_scene(), settings, runs=1)
-    assert line.startswith("ring: 5 training photos, 0.00 GB when decoded: 0.00 GB in memory; a ")
+    assert line.startswith("ring: 5 training photos, 5.8 kB when decoded: 25.7 kB in memory; a ")
     assert line.endswith("training takes 0.50 GB and its model besides")
     settings.photo_memory = LITTLE
-    assert "GB in memory, 0.00 GB on disk; a" in room(make_scene(), settings, runs=1)
+    assert "kB in memory, 5.8 kB on disk; a" in room(make_scene(), settings, runs=1)
 
 
 def test_the_memory_of_a_gpu_is_estimated_by_parts(make_scene, settings):
@@ -101,8 +101,8 @@ def test_the_memory_of_a_gpu_is_estimated_by_parts(make_scene, settings):
     assert device_need(scene, needs, spec, config) == (
         "ring: 3dgs takes about 1.24 GB of the GPU with 1,000,000 primitives in view: model "
         "0.24 GB, gradients and moments 0.71 GB, drawn Gaussians 0.11 GB, rasterizer 0.18 GB, "
-        "images 0.00 GB; an estimate, without what CUDA takes. "
-        "Photos stay there, too, up to a quarter of its free memory (here 0.00 GB)"
+        "images 96.0 kB; an estimate, without what CUDA takes. "
+        "Photos stay there, too, up to a quarter of its free memory (here 5.8 kB)"
     )
     nerf = load_spec("nerf")
     assert device_need(scene, needs, nerf, build_config(nerf, preset="fast")) == ""
@@ -157,7 +157,7 @@ def test_too_little_memory_for_one_photo_is_refused_with_what_is_enough(make_sce
     scene = big(make_scene())
     assert refusal(scene, settings) == (
         "ring: memory for photos: expected at least 0.51 GB to decode photos of 6000 x 4000 "
-        "pixels, found 0.00 GB; scale the photos down, or use --photo-memory 0.51"
+        "pixels, found 1.0 MB; scale the photos down, or use --photo-memory 0.51"
     )
     settings.photo_memory = 510_000_000
     room(scene, settings, runs=1)
@@ -199,7 +199,7 @@ def test_a_full_disk_is_refused_with_a_smaller_setting(make_scene, settings, fre
 
 def test_bench_says_it_and_refuses_before_anything_is_written(bench, tmp_path, runs_here):
     _, said = bench("MEAN")
-    assert any(line.startswith("ring: 5 training photos, 0.00 GB when") for line in said)
+    assert any(line.startswith("ring: 5 training photos, 5.8 kB when") for line in said)
     _, said = bench("MEAN", photo_memory=1)  # finished: needs no photos
     assert not any("training photos" in line for line in said)
     with pytest.raises(ConfigError, match="ring: memory for photos: expected at least"):
