@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +38,7 @@ def convert(
     period_by: str | None = None,
     image_source: ImageSource = "copy",
     progress: Progress | None = None,
+    written: Collection[str] = (),
 ) -> Conversion:
     """Read a scene in any format and write it in another; the source is not changed.
 
@@ -48,6 +50,7 @@ def convert(
         period_by: How images are grouped into periods, where the source leaves a choice.
         image_source: Copy or link the images.
         progress: Called after each image.
+        written: Names of files that the caller writes into ``out`` afterwards.
 
     Raises:
         SceneError: If the source is damaged, or ``out`` is in use.
@@ -57,15 +60,19 @@ def convert(
     check_outside(out, [source])
     detected = detect(source, format=source_format, period_by=period_by)
     scene = detected.read()
-    warnings = (*detected.notes, *remarks_on(scene), *losses(scene, target), *obstacles(scene))
+    notes = (*detected.notes, *remarks_on(scene, written))
+    warnings = (*notes, *losses(scene, target), *obstacles(scene))
     load_format(target).write(scene, out, image_source=image_source, progress=progress)
     return Conversion(scene, out, target, warnings)
 
 
-def remarks_on(scene: Scene) -> list[str]:
-    """List the content of the source that is not read."""
+def remarks_on(scene: Scene, written: Collection[str] = ()) -> list[str]:
+    """List the content of the source that is not read, but for files that are written anew."""
     module = load_format(scene.format)
     found = list(module.remarks(scene.root)) if hasattr(module, "remarks") else []
+    others = module.others(scene.root) if hasattr(module, "others") else []
+    if left := [name for name in others if name not in written]:
+        found.append(f"not part of the format, and not converted: {', '.join(left)}")
     if scene.images_root != scene.root and (count := _unused_images(scene)):
         where = scene.images_root.relative_to(scene.root)
         found.append(

@@ -8,7 +8,8 @@ A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and wher
 - ``assign(images, names, ...)``, where the periods follow from the image names of a COLMAP model,
   which the validator then checks as it is. For such a format, `detect` looks for the model, and the
   functions are ``matches(path, model)`` and ``read(path, model=..., ...)``;
-- ``remarks(path)``, which lists what of a folder does not become part of the scene.
+- ``remarks(path)``, which lists what of a folder does not become part of the scene, and
+  ``others(path)``, names of files and folders in it that are not part of the format.
 
 All raise a `SceneError` for a damaged scene, ``write`` also for a folder that is in use and for
 missing images; a `ConfigError` for a ``period_by`` that is not in ``PERIOD_BY``. What ``write``

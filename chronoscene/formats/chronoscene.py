@@ -82,11 +82,10 @@ def _read_model(path: Path) -> Model:
     return read_model(path / MODEL)
 
 
-def remarks(path: Path) -> list[str]:
-    """List the content of a folder that is not part of the format."""
+def others(path: Path) -> list[str]:
+    """List the files and folders in a folder that are not part of the format."""
     names = {p.name + "/" * p.is_dir() for p in path.iterdir()}
-    others = sorted(names - {"images/", "sparse/", f"{MASKS}/"})
-    return [f"not part of the format, and not converted: {', '.join(others)}"] if others else []
+    return sorted(names - {"images/", "sparse/", f"{MASKS}/"})
 
 
 def raise_first(path: Path, problems: Iterable[splits.Problem]) -> None:

@@ -15,7 +15,11 @@ from chronoscene.convert import convert
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene, writable_formats
 from chronoscene.geodesy import Georeference, from_crs, read_projected
-from chronoscene.registration.report.coordinates import placed_scene, write_coordinates
+from chronoscene.registration.report.coordinates import (
+    coordinate_files,
+    placed_scene,
+    write_coordinates,
+)
 from chronoscene.scene import WorldFrame
 from chronoscene.scene.splits import split_hash
 
@@ -62,6 +66,7 @@ def command(
             period_by=period_by,
             image_source=LINKS[link],
             progress=partial(bar, "images"),
+            written=() if system is None else coordinate_files(),
         )
     scene = done.scene
     if system is not None:

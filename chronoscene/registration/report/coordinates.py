@@ -106,6 +106,12 @@ def write_coordinates(
     write_text_atomic(folder / GEOREFERENCE, json.dumps(record, indent=1) + "\n")
 
 
+def coordinate_files() -> tuple[str, ...]:
+    """Return the names of the files that `write_coordinates` writes in a reference system."""
+    laz = (POINTS_LAZ,) if find_spec("laspy") is not None else ()
+    return (GEOREFERENCE, CAMERAS, POINTS, *laz)
+
+
 def _linear(model: Placed, frame: Georeference, output: ReferenceSystem) -> dict[str, Any]:
     """Linear approximation of the reference system around the middle of the cameras.
 

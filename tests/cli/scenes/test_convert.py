@@ -76,6 +76,11 @@ def test_coordinates_in_a_reference_system(make_scene_folder, tmp_path):
     utm = read_reference_system("", "EPSG:32632")
     np.testing.assert_allclose(utm.to_local(frame, places), centres, atol=1e-3)
     assert (tmp_path / "out/points.ply").is_file()
+    (tmp_path / "out/certificate.json").touch()
+    again = run(tmp_path / "out", tmp_path / "again", "--crs", "EPSG:32633")
+    assert "not part of the format, and not converted: certificate.json\n" in again.stderr
+    without = run(tmp_path / "out", tmp_path / "without")
+    assert "not converted: cameras.csv, certificate.json, georeference.json" in without.stderr
 
 
 def test_coordinates_are_of_the_images_that_were_written(make_scene_folder, tmp_path):
