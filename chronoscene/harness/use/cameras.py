@@ -29,6 +29,10 @@ VIEWS = ("test", "all", "orbit")
 LARGEST_SIDE = 16384
 """Largest width and height of a picture, in pixels."""
 
+FARTHEST = 1e12
+"""Largest radius and height of an orbit, in units of the scene: float32 holds no square of much
+larger ones."""
+
 NORMALISED = "dataparser_transforms.json"
 """File of nerfstudio with the transform from the world to the frame of a model."""
 
@@ -86,7 +90,7 @@ def find_viewpoints(
 
     Raises:
         ConfigError: If the source is none of these, or has no camera, or is no orbit and has the
-            shape of one.
+            shape of one, or an orbit is too far away.
         SceneError: If the scene or the file is missing, damaged, or of an unknown kind.
     """
     shape = shape or OrbitShape()
@@ -97,6 +101,14 @@ def find_viewpoints(
             found=f"--cameras {source}",
             todo="leave them out",
         )
+    for option, length in (("--radius", shape.radius), ("--height", shape.height)):
+        if length is not None and abs(length) > FARTHEST:
+            raise ConfigError(
+                option,
+                expected=f"at most {FARTHEST:g} units of the scene",
+                found=f"{length:g}",
+                todo="choose a smaller one",
+            )
     if source in VIEWS:
         scene = run.scene(scene_root)
         if source == "test" and not scene.select(split="test"):
