@@ -15,7 +15,7 @@ from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.parts import Part
 from chronoscene.harness.plan.settings import SHARING, RunSettings
-from chronoscene.harness.plan.stop import StopRule
+from chronoscene.harness.plan.stop import StopRule, duration_text
 from chronoscene.methods import (
     MethodConfig,
     MethodSpec,
@@ -75,7 +75,7 @@ class ResolvedMethod:
         if settings.budget_seconds is not None:
             if settings.iterations is not None:
                 differ["iterations"] = settings.iterations
-            differ["budget"] = f"{settings.budget_seconds:g}s"
+            differ["budget"] = duration_text(settings.budget_seconds)
         budget_each = settings.separate_iterations == "each" and settings.budget_seconds is not None
         if budget_each or settings.separate_iterations != self._own_sharing:
             differ["separate_iterations"] = settings.separate_iterations

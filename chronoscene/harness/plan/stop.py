@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from decimal import Decimal
 
 from chronoscene.errors import ConfigError
 
@@ -26,6 +27,14 @@ def parse_duration(text: str, option: str = "--budget") -> float:
             todo="write numbers with the units h, m or s",
         )
     return seconds
+
+
+def duration_text(seconds: float) -> str:
+    """Format seconds as `parse_duration` reads them: six digits, or all where six need an ``e``."""
+    text = f"{seconds:g}"
+    if "e" in text:
+        text = f"{Decimal(repr(float(seconds))):f}".removesuffix(".0")
+    return f"{text}s"
 
 
 @dataclass(frozen=True, slots=True)

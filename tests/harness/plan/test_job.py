@@ -16,7 +16,7 @@ from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.resolve import resolve, resolve_method
 from chronoscene.harness.plan.settings import RunSettings
-from chronoscene.harness.plan.stop import StopRule, parse_duration
+from chronoscene.harness.plan.stop import StopRule, duration_text, parse_duration
 from chronoscene.methods import load_spec
 
 JOB = Job(
@@ -43,6 +43,19 @@ def changed(change: dict[str, Any]) -> Job:
 )
 def test_durations(text, seconds):
     assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        *((90, "90s"), (1.5, "1.5s"), (999_999, "999999s"), (123_456.7, "123457s")),
+        *((1_000_000, "1000000s"), (1_234_567.5, "1234567.5s"), (1e22, f"1{'0' * 22}s")),
+        (0.00001, "0.00001s"),
+    ],
+)
+def test_durations_are_read_as_they_are_written(seconds, text):
+    assert duration_text(seconds) == text
+    assert parse_duration(text) == pytest.approx(seconds, rel=1e-5)
 
 
 @pytest.mark.parametrize("text", ["", "5", "m", "0s", "-5m", "5 m", "5min", "1e3s", "5m!"])
@@ -128,6 +141,7 @@ def test_folders_have_names_that_file_systems_take():
         ({"iterations": 9, "overrides": {"rate": "0.25", "sleep": "0"}}, "iterations=9,rate=0.25"),
         ({"iterations": None, "budget_seconds": 90.0}, "budget=90s"),
         ({"iterations": 20, "budget_seconds": 1.5}, "iterations=20,budget=1.5s"),
+        ({"iterations": None, "budget_seconds": 1e6}, "budget=1000000s"),
         ({"iterations": 9, "continued_from": [3, 5]}, "iterations=3+5+9"),
         ({"iterations": 20, "separate_iterations": "each"}, "separate_iterations=each"),
     ],
