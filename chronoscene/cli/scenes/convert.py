@@ -15,6 +15,7 @@ from chronoscene.convert import convert
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene, writable_formats
 from chronoscene.geodesy import Georeference, from_crs, read_projected
+from chronoscene.io.staging import check_outside
 from chronoscene.registration.report.coordinates import (
     coordinate_files,
     placed_scene,
@@ -57,6 +58,7 @@ def command(
     formats.
     """
     system = None if crs is None else read_projected("--crs", crs)
+    check_outside(out, [source], option="OUT")
     with progress_bar(f"read {source}") as bar:
         done = convert(
             source,

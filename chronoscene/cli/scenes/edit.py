@@ -16,7 +16,6 @@ from chronoscene.convert import obstacles, remarks_on
 from chronoscene.edit import MIN_VIEWS, Box, Edited, Edits, edit, read_for_edit
 from chronoscene.errors import ConfigError
 from chronoscene.formats import detect
-from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
@@ -72,8 +71,7 @@ def command(
     )
     if edits == Edits():
         raise click.UsageError("give something to do: --drop, --keep, --crop, --rename, ...")
-    check_outside(out, [source])
-    check_place("OUT", out)
+    check_place("OUT", out, outside=[source])
     with progress_bar(f"read {source}") as bar:
         detected = detect(source, format=dataset_format, period_by=period_by)
         scene, left, images, points = read_for_edit(detected, edits)

@@ -117,11 +117,10 @@ def _check_targets(source: Path, out: Path | None, scene_out: Path | None) -> No
     """Refuse to write into the scene, over an existing file, or nowhere."""
     if out is None and scene_out is None:
         raise click.UsageError("give a file OUT, or --scene-out")
-    for target in (out, scene_out):
-        if target is not None:
-            check_outside(target, [source])
+    if out is not None:
+        check_outside(out, [source], option="OUT")
     if scene_out is not None:
-        check_place("--scene-out", scene_out)
+        check_place("--scene-out", scene_out, outside=[source])
     if out is not None and not out.name:
         raise click.BadParameter("the name of a file is needed", param_hint="OUT")
     if out is not None and _json_beside(out) == out:

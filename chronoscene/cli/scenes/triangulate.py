@@ -13,7 +13,6 @@ from chronoscene.cli.scenes.reading import LINKS, describe, show_note
 from chronoscene.convert import obstacles, remarks_on
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import detect
-from chronoscene.io.staging import check_outside
 from chronoscene.registration.triangulation import Triangulated, triangulate
 
 
@@ -42,8 +41,7 @@ def command(
     changed. Poses, cameras, periods and split stay; points that SCENE has are replaced. The same
     command continues a run that was stopped.
     """
-    check_outside(out, [source])
-    check_place("OUT", out)
+    check_place("OUT", out, outside=[source])
     with showing_notes(), progress_bar(f"read {source}") as report:
         detected = detect(source, format=dataset_format, period_by=period_by)
         scene = detected.read()

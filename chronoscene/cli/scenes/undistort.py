@@ -51,7 +51,7 @@ def command(
     cameras without distortion are copied; others become 8-bit RGB, and transparent pixels become a
     mask.
     """
-    check_outside(out, [source])
+    check_outside(out, [source], option="OUT")
     with progress_bar(f"read {source}") as bar:
         scene = read_and_note(source, dataset_format, period_by)
         done = undistort(

@@ -123,7 +123,7 @@ def test_help_lists_formats_and_groupings():
     ("arguments", "message"),
     [
         (["{tmp}/absent", "{tmp}/out"], "expected a scene folder, found nothing"),
-        (["{scene}", "{scene}/out"], "expected a place outside the scene"),
+        (["{scene}", "{scene}/out"], "OUT {scene}/out: expected a place outside the scene"),
         (["{scene}", "{tmp}"], "expected a new or empty folder"),
         (["{scene}", "{tmp}/out", "--period-by", "year"], "--period-by: expected no such option"),
     ],
@@ -136,7 +136,8 @@ def test_errors_are_one_line(make_scene_folder, tmp_path, monkeypatch, capsys, a
         main()
     assert stopped.value.code == 2
     error = capsys.readouterr().err
-    assert message in error.splitlines()[-1] and error.count("\n") <= 2  # after "read SRC"
+    assert message.format(scene=scene) in error.splitlines()[-1]
+    assert error.count("\n") <= 2  # after "read SRC"
 
 
 def test_dataset_commands_do_not_need_torch():

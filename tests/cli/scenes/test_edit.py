@@ -62,7 +62,7 @@ def test_never_into_the_scene(make_scene_folder, monkeypatch, capsys, command):
     monkeypatch.setattr(sys, "argv", ["chronoscene", name, str(folder), f"{folder}/out", *options])
     with pytest.raises(SystemExit):
         main()
-    assert "a place outside the scene" in capsys.readouterr().err
+    assert f"OUT {folder}/out: expected a place outside the scene" in capsys.readouterr().err
 
 
 def test_photos_without_common_features(make_scene_folder, tmp_path, monkeypatch, capsys):

@@ -80,9 +80,9 @@ def test_whole_periods_are_remarked_upon(scene, tmp_path):
         (["{scene}"], "give a file OUT, or --scene-out"),
         (["{scene}", "{tmp}/o", "--every", "4", "--fraction", "0.1"], "not both"),
         (["{scene}", "{tmp}/o", "--every", "1"], "2 or more is needed"),
-        (["{scene}", "{scene}/sparse/0/test.txt"], "a place outside the scene"),
+        (["{scene}", "{scene}/sparse/0/test.txt"], "OUT {scene}/sparse/0/test.txt: expected a"),
         (["{scene}", ""], "the name of a file is needed"),
-        (["{scene}", "--scene-out", "{scene}/new"], "a place outside the scene"),
+        (["{scene}", "--scene-out", "{scene}/new"], "--scene-out {scene}/new: expected a place"),
         (["{scene}", "{tmp}/there.txt"], "expected a new file, found an existing one"),
         (["{scene}", "{tmp}/other.txt"], "other.json: expected a new file"),
         (["{scene}", "{tmp}/there.txt/o"], "expected a file that can be written"),
@@ -104,7 +104,7 @@ def test_errors(scene, tmp_path, monkeypatch, capsys, arguments, message):
         main()
     assert stopped.value.code == 2
     error = capsys.readouterr().err
-    assert message in error and "Traceback" not in error
+    assert message.format(scene=scene) in error and "Traceback" not in error
     assert snapshot(tmp_path) == before
 
 

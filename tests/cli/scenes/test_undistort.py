@@ -64,7 +64,7 @@ def test_says_that_nothing_had_to_be_done(make_scene_folder, tmp_path):
     ("arguments", "message"),
     [
         (["{tmp}/absent", "{tmp}/out"], "expected a scene folder, found nothing"),
-        (["{scene}", "{scene}/out"], "expected a place outside the scene"),
+        (["{scene}", "{scene}/out"], "OUT {scene}/out: expected a place outside the scene"),
         (["{scene}", "{tmp}"], "expected a new or empty folder"),
     ],
 )
@@ -75,7 +75,8 @@ def test_errors_are_one_line(distorted, tmp_path, monkeypatch, capsys, arguments
         main()
     assert stopped.value.code == 2
     error = capsys.readouterr().err
-    assert message in error.splitlines()[-1] and error.count("\n") <= 2  # after "read SCENE"
+    assert message.format(scene=distorted) in error.splitlines()[-1]
+    assert error.count("\n") <= 2  # after "read SCENE"
 
 
 @pytest.mark.parametrize(("link", "is_symlink"), [("hard", False), ("sym", True)])
