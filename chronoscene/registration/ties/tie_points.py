@@ -359,7 +359,7 @@ def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int |
             raise _wrong(
                 tie_points.path, click.line, "the name of one image",
                 f"{click.image!r}, which fits {ends[0]} and {ends[1]}",
-                "write the name with its folder",
+                "write the name with its folder, as in the scene",
             )  # fmt: skip
         found[click.image] = index[ends[0]] if ends else None
     if found and all(i is None for i in found.values()):
@@ -372,13 +372,24 @@ def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int |
 
 
 def _names_of(image: str, names: Sequence[str]) -> list[str]:
-    """Names that an image may mean: as it is written, or as `place_photos` renames a photo."""
+    """Names that an image may mean: as it is written, or as `place_photos` renames a photo.
+
+    Where another photo had the name without blanks, the renamed one has a number, so that a name
+    with blanks may mean either.
+    """
     written = PurePosixPath(image.replace("\\", "/")).as_posix()
     plain = re.sub(r"\s", "_", written)
-    for name in (written, plain, f"{plain}.png"):
-        if found := [name] if name in names else [n for n in names if n.endswith(f"/{name}")]:
-            return found
-    return []
+    if found := _ending(written, names):
+        return found
+    if found := _ending(plain, names):
+        numbered = PurePosixPath(plain).with_stem(f"{PurePosixPath(plain).stem}_2")
+        return found + (_ending(str(numbered), names) if plain != written else [])
+    return _ending(f"{plain}.png", names)
+
+
+def _ending(name: str, names: Sequence[str]) -> list[str]:
+    """Return the name itself, if it is there, or those of which it is the end."""
+    return [name] if name in names else [n for n in names if n.endswith(f"/{name}")]
 
 
 def _number(path: Path, line: int, text: str, what: str) -> float:

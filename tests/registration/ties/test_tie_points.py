@@ -16,6 +16,7 @@ from benchmarks.registration.generated import (
     pose_errors,
 )
 from chronoscene.errors import SceneError
+from chronoscene.registration.photos.inputs import plain_names
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.ties.residuals import with_tie_tracks
@@ -185,6 +186,15 @@ def test_images_may_have_their_names_of_before_registration(tmp_path: Path) -> N
     before, after = ("2016/a b.jpg", "2016/c d.tif"), ("2016/a_b.jpg", "2016/c_d.tif.png")
     for names in (before, after):
         assert match_images(points, names) == {"2016/a b.jpg": 0, "c d.tif": 1}
+
+
+def test_a_name_with_blanks_that_may_be_either_of_two_photos(tmp_path: Path) -> None:
+    names = plain_names(["a_b.jpg", "a b.jpg"])
+    points = read(tmp_path, "p,a b.jpg,1,2\n")
+    with pytest.raises(SceneError, match=r"'a b.jpg', which fits a_b.jpg and a_b_2.jpg; .* scene"):
+        match_images(points, names)
+    points = read(tmp_path, "p,a_b.jpg,1,2\np,a_b_2.jpg,1,2\n")
+    assert match_images(points, names) == {"a_b.jpg": 0, "a_b_2.jpg": 1}
 
 
 def test_images_are_found_by_the_end_of_their_path(tmp_path: Path) -> None:
