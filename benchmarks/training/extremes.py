@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -70,12 +71,17 @@ def cell(results: Sequence[Result], presets: int, errors: list[str]) -> str:
     text = worst
     if worst != "trained" or len(results) < presets:
         text += f": {', '.join(r['preset'] for r in results if r['outcome'] == worst)}"
-    for message in dict.fromkeys(r["error"] for r in results if r["outcome"] == worst):
-        if message is not None:
+    for message in dict.fromkeys(said(r["error"]) for r in results if r["outcome"] == worst):
+        if message:
             if message not in errors:
                 errors.append(message)
             text += f" [{errors.index(message) + 1}]"
     return text if len(results) == presets else f"{text} ({len(results)} of {presets})"
+
+
+def said(error: str | None) -> str:
+    """Return what an error expected and found, without its iteration and the remedy."""
+    return re.sub(r", iteration \d+", "", (error or "").partition("; ")[0])
 
 
 def worst_outcomes(results: Sequence[Result], chosen: Sequence[Any], names: Sequence[str]) -> str:
