@@ -71,11 +71,14 @@ def command(
     else:
         points = read_tie_points(tie_points, scale=tie_scale, crs=system)
     with progress_bar(f"read {captures}") as report:
-        found = read_captures(captures, table=table).images
+        read = read_captures(captures, table=table)
+        found = read.images
         text = marking_page(
             found, points=points, model=model, max_size=max_size, title=page.stem, report=report
         )
     write_text_atomic(page, text)
+    for name, _, reason in read.refused:
+        say(f"note: {name} is not on the page: {reason}")
     if points is not None and (others := clicks_elsewhere(points, found)):
         say(
             f"note: {counted(len(others), 'click')} in photos that are not in CAPTURES, such as "

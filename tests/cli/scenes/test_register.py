@@ -224,13 +224,3 @@ def test_options_without_an_effect_are_refused(
     done = call(photos(tmp_path / "in/a", 3), tmp_path / "out", option, value, *other)
     assert str(done.exception).startswith(f"{option}: expected no such option {condition}")
     assert not (tmp_path / "out.work").exists()
-
-
-@pytest.mark.parametrize(("option", "value"), [("--tie-scale", "2"), ("--crs", "EPSG:32632")])
-def test_mark_refuses_options_of_points_that_are_not_given(
-    tmp_path: Path, option: str, value: str
-) -> None:
-    words = ["mark", photos(tmp_path / "in", 2), tmp_path / "page.html", option, value]
-    done = CliRunner().invoke(main, list(map(str, words)))
-    assert str(done.exception).startswith(f"{option}: expected no such option without --tie-points")
-    assert not (tmp_path / "page.html").exists()
