@@ -22,9 +22,17 @@ from chronoscene.rasterizer.cpu import DirectRender
 from chronoscene.rasterizer.cpu.layout import LANES
 from chronoscene.rasterizer.inputs import Inputs, check_settings
 from chronoscene.training import devices
-from chronoscene.training.drawing import Splats, camera_tensors
+from chronoscene.training.drawing import (
+    Chance,
+    Splats,
+    camera_tensors,
+    opacity_factors,
+    step_background,
+)
 from chronoscene.training.losses import add_mean_volume
 from chronoscene.training.photometric import loss_and_gradient
+
+_SCALES, _OPACITIES = (Splats._fields.index(name) for name in ("scales", "opacities"))
 
 
 class DirectPass(NamedTuple):
@@ -47,6 +55,7 @@ def learn_directly(
     photo: Tensor,
     background: Tensor,
     config: AnchorConfig,
+    chance: Chance,
 ) -> DirectPass | None:
     """Draw a view, compare it with its photo, and go back to the tensors of the model.
 
@@ -55,8 +64,9 @@ def learn_directly(
         inputs: What its decoder reads.
         view: The camera.
         photo: uint8 0..255. [H, W, 3]
-        background: Colour behind everything. [3]
+        background: The usual colour behind everything. [3]
         config: Options of drawing and loss.
+        chance: Decides on what is random.
 
     Returns:
         None where autograd has to do it: the kernels do not run on the device, the model gives its
@@ -71,11 +81,17 @@ def learn_directly(
     splats = Splats(*outputs[2:7])
     if len(splats.means) < LANES:
         return None
-    render = DirectRender(_raster_inputs(splats, view, background, config))
+    factors, drawn = opacity_factors(splats.opacities, config, chance), splats
+    if factors is not None:
+        drawn = splats._replace(opacities=splats.opacities * factors)
+    background = step_background(background, config, chance)
+    render = DirectRender(_raster_inputs(drawn, view, background, config))
     loss, image_gradient = loss_and_gradient(render.image, photo, ssim_weight=config.ssim_weight)
     grads = render.backward(image_gradient)
+    if factors is not None:
+        grads[_OPACITIES].mul_(factors)
     if config.scale_weight:
-        volume = (splats.scales, splats.opacities, config.scale_weight, grads[2])
+        volume = (splats.scales, splats.opacities, config.scale_weight, grads[_SCALES])
         loss = loss + add_mean_volume(*volume)
     found = job.backward(outputs, grads)
     for tensor, gradient in zip(tensors, found, strict=True):

@@ -26,7 +26,7 @@ from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.checkpoint import TrainingState, check_views, parts
 from chronoscene.training.devices import has_kernels
-from chronoscene.training.drawing import camera_centre_tensor, draw_in_training, step_background
+from chronoscene.training.drawing import Chance, camera_centre_tensor, draw_in_training
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import BackwardPass, collect_gradients, joined, judge_gradients
 from chronoscene.training.losses import mean_volume, training_loss
@@ -45,8 +45,8 @@ class Drawn(NamedTuple):
 
     number: int
     """Number of the view."""
-    draw: int
-    """Number of the draw from 1, by which a random background is chosen."""
+    chance: Chance
+    """Decides on what is random."""
     photo: Tensor
     """uint8 [H, W, 3]"""
     mask: Tensor | None
@@ -114,7 +114,7 @@ class AnchorTrainer:
         """
         count = views_of_step(self.views, index, progress)
         done = self._progress_after(index, count, progress)
-        due = [self._draw() for _ in range(count)]
+        due = [self._draw(progress) for _ in range(count)]
         if has_kernels(self.model.anchors) and not self.exposure.tables:
             passes = side_by_side(self._learn, due)
         else:
@@ -146,11 +146,11 @@ class AnchorTrainer:
         """Return the share of the training that is over once this step is done."""
         return progress * (index + count) / index if index > 0 else count / self.config.iterations
 
-    def _draw(self) -> Drawn:
-        """Draw the next view and load its photo."""
+    def _draw(self, progress: float) -> Drawn:
+        """Draw the next view and load its photo; arguments as in `step`."""
         number = self.sampler.next()
         photo, mask = self.photos.photo(number), self.photos.mask(number)
-        return Drawn(number, self.sampler.drawn, photo, mask)
+        return Drawn(number, Chance(self.seed, self.sampler.drawn, progress), photo, mask)
 
     def _learn(self, due: Drawn) -> ViewPass:
         """Draw a training view and collect gradients; the model and its optimiser stay."""
@@ -178,8 +178,9 @@ class AnchorTrainer:
         config, view = self.config, self.train.views[due.number]
         with torch.no_grad():
             inputs = seen.model.decode_inputs(*self._decode_arguments(seen.model, view))
-        background = step_background(self.background, config, seed=self.seed, number=due.draw)
-        found = learn_directly(seen.model, inputs, view, due.photo, background, config)
+        found = learn_directly(
+            seen.model, inputs, view, due.photo, self.background, config, due.chance
+        )
         if found is None:
             return None
         result = judge_gradients(found.loss, found.info, seen.gradients())
@@ -188,9 +189,7 @@ class AnchorTrainer:
     def _learn_by_autograd(self, seen: SeenAnchors, due: Drawn) -> Learned:
         config, view = self.config, self.train.views[due.number]
         splats, positions = seen.model.decode_active(*self._decode_arguments(seen.model, view))
-        raster = draw_in_training(
-            splats, view, self.background, config, seed=self.seed, number=due.draw
-        )
+        raster = draw_in_training(splats, view, self.background, config, due.chance)
         loss = training_loss(
             raster, due.photo, due.mask, number=due.number, exposure=self.exposure, config=config
         )

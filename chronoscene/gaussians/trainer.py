@@ -25,7 +25,7 @@ from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import TrainingState, check_views, parts
-from chronoscene.training.drawing import Splats, draw_in_training
+from chronoscene.training.drawing import Chance, Splats, draw_in_training
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import BackwardPass, collect_gradients, joined
 from chronoscene.training.losses import steady_mean, training_loss
@@ -184,9 +184,8 @@ class GaussianTrainer:
         number = self.sampler.next()
         view = self.train.views[number]
         splats = self.splats(number)
-        raster = draw_in_training(
-            splats, view, self.background, self.config, seed=self.seed, number=self.sampler.drawn
-        )
+        chance = Chance(self.seed, self.sampler.drawn, due.progress)
+        raster = draw_in_training(splats, view, self.background, self.config, chance)
         mask = self.photos.mask(number)
         self.optimizer.zero_grad()
         result = collect_gradients(

@@ -43,6 +43,10 @@ class SplattingConfig:
     random_background: bool = False
     """Train with another colour behind everything in each step, so that no Gaussian is missing
     where a photo shows that colour. Images are rendered with the usual background."""
+    opacity_dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of the Gaussians that a step leaves out at random; it grows from 0 to this over the
+    training. The others are as much more opaque. Few photos are then learned less by heart (Park
+    et al. 2025, DropGaussian, where it is 0.2)."""
     cooldown: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the training, its last, in which all learning rates of the model fall further, to a
     tenth of what they would be: the model settles. Not in the papers."""

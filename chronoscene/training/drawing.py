@@ -18,7 +18,7 @@ from chronoscene.training.config import SplattingConfig
 from chronoscene.training.devices import to_device
 from chronoscene.training.exposure import transformed
 
-_BACKGROUND_STREAM = 3  # Keeps the colours of `step_background` apart from other random choices
+_BACKGROUND_STREAM, _DROPOUT_STREAM = 3, 10  # Keep what is drawn here apart from the rest
 
 
 class Splats(NamedTuple):
@@ -34,6 +34,21 @@ class Splats(NamedTuple):
     """A Gaussian with an opacity of 0 or less is not drawn. [N]"""
     colors: Tensor
     """RGB. [N, 3]"""
+
+
+class Chance(NamedTuple):
+    """Seed of the random choices for a view of a training step."""
+
+    seed: int
+    """Seed of the run."""
+    draw: int
+    """Number of the view among those drawn so far, from 1."""
+    progress: float
+    """Share of the training that is over."""
+
+    def generator(self, stream: int) -> np.random.Generator:
+        """Make the generator of one kind of choice."""
+        return np.random.default_rng((self.seed, stream, self.draw))
 
 
 def draw(
@@ -88,40 +103,52 @@ def weights_in(
     return gradient
 
 
-def step_background(
-    background: Tensor, config: SplattingConfig, *, seed: int, number: int
-) -> Tensor:
-    """Return the colour behind everything in one step of a training. [3] -> [3]
+def step_background(background: Tensor, config: SplattingConfig, chance: Chance) -> Tensor:
+    """Return the colour behind everything in a view of a training step. [3] -> [3]
 
     Args:
         background: The usual colour.
         config: Asks for the usual colour or a random one.
-        seed: Seed of the run.
-        number: Number of the step; with the seed, all that a random colour depends on.
+        chance: Decides on a random one.
     """
     if not config.random_background:
         return background
-    generator = np.random.default_rng((seed, _BACKGROUND_STREAM, number))
-    return to_device(generator.random(3, np.float32), background.device)
+    colour = chance.generator(_BACKGROUND_STREAM).random(3, np.float32)
+    return to_device(colour, background.device)
+
+
+def opacity_factors(opacities: Tensor, config: SplattingConfig, chance: Chance) -> Tensor | None:
+    """Return what a step multiplies opacities by, to leave Gaussians out at random. [N] -> [N]
+
+    These have 0, the others 1 / (1 - r), where r is the share of the former, which grows with the
+    training: the mean opacity is as before (DropGaussian, Park et al. 2025).
+
+    Args:
+        opacities: Of the Gaussians.
+        config: Asks for the share at the end of the training; None is returned where it is 0.
+        chance: Decides which are left out.
+    """
+    share = config.opacity_dropout * min(chance.progress, 1.0)
+    if share == 0:
+        return None
+    kept = chance.generator(_DROPOUT_STREAM).random(len(opacities), np.float32) >= share
+    return to_device(kept * np.float32(1 / (1 - share)), opacities.device)
 
 
 def draw_in_training(
-    splats: Splats,
-    view: View,
-    background: Tensor,
-    config: SplattingConfig,
-    *,
-    seed: int,
-    number: int,
+    splats: Splats, view: View, background: Tensor, config: SplattingConfig, chance: Chance
 ) -> Rasterization:
     """Draw a view in a training step, as the options ask for; arguments as `step_background`.
 
     Both trainers draw by it: what a term of the loss needs, such as depth, is asked for here.
     """
+    factors = opacity_factors(splats.opacities, config, chance)
+    if factors is not None:
+        splats = splats._replace(opacities=splats.opacities * factors)
     return draw(
         splats,
         view,
-        step_background(background, config, seed=seed, number=number),
+        step_background(background, config, chance),
         near_plane=config.near_plane,
         antialiased=config.antialiased,
         absgrad=config.absgrad,

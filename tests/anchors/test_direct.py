@@ -11,11 +11,13 @@ import torch
 from benchmarks.training.generated import make, training_set
 from chronoscene.anchors.trainer import AnchorTrainer, Drawn
 from chronoscene.errors import ShapeError
+from chronoscene.training.drawing import Chance
 
 OPTIONS: list[dict[str, Any]] = [
     {},
     {"antialiased": True, "scale_weight": 0.0, "global_dim": 0},
     {"random_background": True, "period_dim": 0},
+    {"opacity_dropout": 0.3, "scale_weight": 0.1},
 ]
 
 
@@ -30,7 +32,7 @@ def learn(trainer: AnchorTrainer, way: str) -> tuple[Any, dict[str, torch.Tensor
     number, row = 4, int(trainer.feature_rows[4])
     view, photo = trainer.train.views[number], torch.from_numpy(trainer.train.load_image(number))
     seen = trainer.optimizer.seen(trainer.model.visible(view), row)
-    due = Drawn(number, trainer.sampler.drawn, photo, None)
+    due = Drawn(number, Chance(0, trainer.sampler.drawn, 0.5), photo, None)
     found = (trainer._learn_directly if way == "direct" else trainer._learn_by_autograd)(seen, due)
     return found, seen.gradients()
 

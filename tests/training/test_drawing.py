@@ -1,4 +1,4 @@
-"""Cameras as tensors, backgrounds, and what Gaussians add to a view."""
+"""Cameras as tensors, what is random in a step, and what Gaussians add to a view."""
 
 import numpy as np
 import torch
@@ -6,10 +6,13 @@ import torch
 from chronoscene.methods import View
 from chronoscene.training.config import SplattingConfig
 from chronoscene.training.drawing import (
+    Chance,
     Splats,
     camera_centre_tensor,
     camera_tensors,
     draw,
+    draw_in_training,
+    opacity_factors,
     step_background,
     weights_in,
 )
@@ -50,18 +53,53 @@ def test_the_camera_sees_its_centre_at_the_origin():
 def test_a_random_background_follows_from_the_seed_and_the_step() -> None:
     usual = torch.tensor([1.0, 0.0, 0.5])
     config = SplattingConfig()
-    assert step_background(usual, config, seed=0, number=3) is usual
+    assert step_background(usual, config, Chance(0, 3, 0.5)) is usual
     config = SplattingConfig(random_background=True)
     colors = [
-        step_background(usual, config, seed=seed, number=number)
-        for seed, number in ((0, 3), (0, 3), (0, 4), (1, 3))
+        step_background(usual, config, Chance(seed, draw, 0.5))
+        for seed, draw in ((0, 3), (0, 3), (0, 4), (1, 3))
     ]
     assert torch.equal(colors[0], colors[1])
     assert not torch.equal(colors[0], colors[2]) and not torch.equal(colors[0], colors[3])
-    many = torch.stack(
-        [step_background(usual, config, seed=0, number=number) for number in range(300)]
-    )
+    many = torch.stack([step_background(usual, config, Chance(0, i, 0.5)) for i in range(300)])
     assert 0 <= many.min() < 0.05 and 0.95 < many.max() < 1
+
+
+def test_a_growing_share_of_gaussians_is_left_out() -> None:
+    opacities, config = torch.full((20_000,), 0.5), SplattingConfig(opacity_dropout=0.4)
+    assert opacity_factors(opacities, SplattingConfig(), Chance(0, 3, 0.5)) is None
+    assert opacity_factors(opacities, config, Chance(0, 1, 0.0)) is None
+    for progress, share in ((0.5, 0.2), (1.0, 0.4), (1.5, 0.4)):
+        factors = opacity_factors(opacities, config, Chance(0, 3, progress))
+        assert factors is not None and abs((factors == 0).float().mean() - share) < 0.01
+        np.testing.assert_allclose(factors[factors > 0], 1 / (1 - share), rtol=1e-6)
+        assert abs(factors.mean() - 1) < 0.02
+        again = opacity_factors(opacities, config, Chance(0, 3, progress))
+        assert again is not None and torch.equal(factors, again)
+        for other in (Chance(1, 3, progress), Chance(0, 4, progress)):
+            changed = opacity_factors(opacities, config, other)
+            assert changed is not None and not torch.equal(factors, changed)
+
+
+def test_gaussians_left_out_are_not_drawn_and_learn_nothing() -> None:
+    view, config = make_view(), SplattingConfig(opacity_dropout=0.5)
+    chance = Chance(0, 2, 1.0)
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(40, 3, generator=generator) * 0.2
+    opacities = torch.full((40,), 0.4, requires_grad=True)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).expand(40, 4)
+    splats = Splats(means, quats, torch.full((40, 3), 0.05), opacities, torch.ones(40, 3))
+    raster = draw_in_training(splats, view, torch.zeros(3), config, chance)
+    raster.image.sum().backward()
+    factors = opacity_factors(opacities, config, chance)
+    assert factors is not None and opacities.grad is not None
+    kept = factors > 0
+    alone = Splats(*(value.detach()[kept] for value in splats))
+    alone = alone._replace(opacities=alone.opacities * 2)
+    wanted = draw_in_training(alone, view, torch.zeros(3), SplattingConfig(), chance)
+    assert 5 < int(kept.sum()) < 35 and wanted.image.max() > 0.5
+    torch.testing.assert_close(raster.image.detach(), wanted.image)
+    assert not opacities.grad[~kept].any() and bool((opacities.grad[kept] != 0).all())
 
 
 def test_weights_in_a_region_are_what_is_drawn_there():
