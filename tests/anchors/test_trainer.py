@@ -18,7 +18,7 @@ from chronoscene.anchors.trainer import AnchorTrainer, Drawn
 from chronoscene.kernels import side_by_side
 from chronoscene.methods.interface import Skipped
 from chronoscene.rasterizer import rasterize
-from chronoscene.training.drawing import camera_centre_tensor, camera_tensors
+from chronoscene.training.drawing import Chance, camera_centre_tensor, camera_tensors
 from chronoscene.training.gradients import BackwardPass, joined
 from chronoscene.training.losses import mean_volume
 from chronoscene.training.photometric import photometric_loss
@@ -60,7 +60,7 @@ def learned(trainer: AnchorTrainer, monkeypatch: pytest.MonkeyPatch) -> dict[str
 def learned_alone(trainer: AnchorTrainer, number: int) -> dict[str, Tensor]:
     """Gradients of the loss of one view, with a row for each of the model."""
     photo = torch.from_numpy(trainer.train.load_image(number))
-    seen = trainer._learn(Drawn(number, 1, photo, None)).seen
+    seen = trainer._learn(Drawn(number, Chance(0, 1, 0.5), photo, None)).seen
     found = seen.gradients()
     rows = {**seen.rows, "global_features": torch.tensor([seen.row])}
     for name, read in rows.items():
