@@ -35,6 +35,8 @@ OPTIONS = [
     ("chronogs", {"views_per_step": 3, "density_interval": 8}),
     ("scaffold-gs", {"views_per_step": 2, "exposure": "image"}),
     ("cl-splats", {"views_per_step": 2}),
+    ("3dgs", {"opacity_dropout": 0.4}),
+    ("chronogs", {"opacity_dropout": 0.4, "views_per_step": 2}),
     ("3dgs", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
     ("gs-w", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
 ]
@@ -118,6 +120,14 @@ def test_a_random_background_leaves_no_hole_where_photos_are_as_dark_as_it(name)
         train(method)
         drawn.append(float(np.mean([method.render(v, 0.0).alpha.mean() for v in data.views])))
     assert drawn[1] > 1.2 * drawn[0]
+
+
+@pytest.mark.parametrize("name", ["3dgs", "scaffold-gs", "chronogs", *GAUSSIANS])
+def test_steps_leave_gaussians_out_once_the_training_is_under_way(name):
+    data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))
+    usual, thinned = start(name, data), start(name, data, opacity_dropout=0.9)
+    assert usual.step(0, 0.0).loss == thinned.step(0, 0.0).loss
+    assert abs(thinned.step(1, 0.9).loss - usual.step(1, 0.9).loss) > 1e-4
 
 
 @pytest.mark.parametrize("name", ["3dgs", *GAUSSIANS])
