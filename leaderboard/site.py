@@ -169,7 +169,7 @@ class _Site:
                 printed,
                 self.colors,
             )
-            for setting in sorted(settings)
+            for setting in sorted(settings, key=_place)
             if setting.scene == scene
         ]
         if not groups:
@@ -213,7 +213,15 @@ def _grouped(standings: Iterable[Standing], kind: str) -> dict[Setting, Part]:
     """Summarise the runs of a kind in each setting."""
     chosen = [s for s in standings if bool(s.claimed) == (kind == CLAIMED)]
     groups = comparable(record for standing in chosen for record in standing.records)
-    return {setting: Part(runs, summarise(runs)) for setting, runs in groups.items()}
+    return {
+        setting: Part(groups[setting], summarise(groups[setting]))
+        for setting in sorted(groups, key=_place)
+    }
+
+
+def _place(setting: Setting) -> tuple[str | int, ...]:
+    """Return the place of a setting on a page: 500 training steps come before 1,000."""
+    return (*setting.test, len(setting.effort), setting.effort)
 
 
 def _measured(

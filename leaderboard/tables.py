@@ -164,5 +164,5 @@ def make_cell(row: Any, *, ranked: bool = True) -> dict[str, Any]:
 def row_order(kind: str, label: str, cell: dict[str, Any] | None) -> tuple[float, str]:
     """Sort verified rows by their value, and the others by their name."""
     if kind == CLAIMED:
-        return 0.0, label
+        return 0.0, label.casefold()
     return -cell["value"] if cell else math.inf, label

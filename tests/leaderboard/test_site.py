@@ -249,6 +249,16 @@ def test_times_of_devices_have_columns_of_their_own(make_run, enter, tmp_path):
     assert "code: 1111111111-dirty" in page.read_text()
 
 
+def test_short_trainings_and_first_letters_come_first(make_run, enter, tmp_path):
+    runs = [make_run("4dgs", iterations=1000), make_run("3dgs", iterations=500)]
+    runs += [make_run(name, iterations=1000) for name in ("scaffold-gs", "realtime4dgs")]
+    enter(runs, tmp_path / "e")
+    write_site(standings(tmp_path / "e", "untested"), load_published(), tmp_path / "site")
+    text = (tmp_path / "site/scene/square.html").read_text(encoding="utf-8")
+    shown = "<h2>500 training", "<h2>1,000 training", ">4DGS", ">realtime4DGS", ">Scaffold-GS"
+    assert [*shown] == sorted(shown, key=text.index)
+
+
 def test_commands_make_the_run_again(make_run, enter, tmp_path):
     enter([make_run(variant="sh_degree=2,budget=90s", max_width=800)], tmp_path / "e")
     write_site(standings(tmp_path / "e"), load_published(), tmp_path / "site")
