@@ -337,7 +337,8 @@ def compare_with(
             chosen=chosen,
         )
     entries.loc[others, "tied"] = np.abs(difference) <= np.where(known, margin, by_seeds)
-    if freedom < 2:  # such a t-distribution has no variance: hundreds of dB would say nothing
+    # Up to 2, a t-distribution has no finite variance, and tens of dB would say nothing.
+    if round(freedom, 6) <= 2:
         margin[:] = math.nan
     entries.loc[others, [*DIFFERENCE]] = np.stack(
         [difference, difference - margin, difference + margin, by_seeds], axis=1

@@ -139,11 +139,14 @@ def test_what_views_do_not_tell_apart_is_tied():
     assert found["b"].difference_low < 0 < found["b"].difference_high
 
 
-@pytest.mark.parametrize(("views", "shown"), [(4, False), (5, True)])
-def test_a_few_views_of_a_period_tie_without_an_interval(views, shown):
+@pytest.mark.parametrize(
+    ("column", "views", "shown"),
+    [("period 0", 4, False), ("period 0", 5, True), ("macro", 2, False), ("macro", 3, True)],
+)
+def test_a_few_views_tie_without_an_interval(column, views, shown):
     some, others = VIEWS[:, :views], (VIEWS - 1 + NOISE)[:, :views]
     found = summarise([scored("a", psnr=some), scored("b", psnr=others)], ["psnr"])
-    (b,) = found[(found.method == "b") & (found.column == "period 0")].itertuples()
+    (b,) = found[(found.method == "b") & (found.column == column)].itertuples()
     assert b.tied and np.isfinite(b.difference_low) == shown
 
 
