@@ -67,7 +67,7 @@ def build_config(
             check_choice(place, key, adapters)
             values[key] = _parsed(f"{place} {key}", value, adapters[key])
     config: MethodConfig = config_class(**values)
-    idle = config.without_effect() if hasattr(config, "without_effect") else {}
+    idle = idle_options(config)
     for place, given in places:
         for key in given.keys() & idle.keys():
             raise ConfigError(
@@ -77,6 +77,11 @@ def build_config(
                 todo=f"leave {key} out, or change that option",
             )
     return config
+
+
+def idle_options(config: MethodConfig) -> dict[str, str]:
+    """Return options that have no effect beside the others of a config, and what they need."""
+    return config.without_effect() if hasattr(config, "without_effect") else {}
 
 
 def config_from_values(spec: MethodSpec, values: Mapping[str, Any]) -> MethodConfig:

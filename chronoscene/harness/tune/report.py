@@ -30,6 +30,8 @@ class TrialResult:
     number: int
     psnr: float | None
     """Mean over scenes of the macro mean over validation views, in dB; None if it failed."""
+    ssim: float | None
+    """Mean of the same kind, which the search does not use; also None in trials that lack it."""
     seconds: float
     """Training clock, sum over the scenes."""
     checkpoint_bytes: int
@@ -55,6 +57,7 @@ def read_results(study: Study, method: ResolvedMethod) -> list[TrialResult]:
             TrialResult(
                 number=trial.number,
                 psnr=trial.value,
+                ssim=found.get("ssim"),
                 seconds=found["seconds"],
                 checkpoint_bytes=found["bytes"],
                 options={name: options[name] for name in method.spec.search},
@@ -83,10 +86,18 @@ def write_report(
         about: Settings of the search, for the preset.
         out: Folder of the search.
     """
-    columns = ["trial", "psnr", "seconds", "checkpoint_bytes", *method.spec.search, "failure"]
+    columns = [
+        "trial",
+        "psnr",
+        "ssim",
+        "seconds",
+        "checkpoint_bytes",
+        *method.spec.search,
+        "failure",
+    ]
     rows = [
         [
-            *(result.number, result.psnr, result.seconds, result.checkpoint_bytes),
+            *(result.number, result.psnr, result.ssim, result.seconds, result.checkpoint_bytes),
             *map(as_typed, result.options.values()),
             result.failure,
         ]
@@ -123,18 +134,19 @@ def trials_table(results: Sequence[TrialResult]) -> Table:
     best = best_of(results)
     options = list(results[0].options) if results else []
     return Table(
-        heads=["trial", "PSNR", "seconds", "size", *options],
+        heads=["trial", "PSNR", "SSIM", "seconds", "size", *options],
         rows=[
             [
                 str(result.number),
                 "failed" if result.psnr is None else f"{result.psnr:.3f}",
+                "-" if result.ssim is None else f"{result.ssim:.3f}",
                 f"{result.seconds:.1f}",
                 in_words(result.checkpoint_bytes),
                 *map(_short, result.options.values()),
             ]
             for result in results
         ],
-        title="PSNR on validation views; the first trial is the preset",
+        title="PSNR and SSIM on validation views; the first trial is the preset",
         ranks={(i, 1): 1 for i, result in enumerate(results) if result is best},
     )
 

@@ -37,6 +37,7 @@ from chronoscene.harness.tune.report import TrialResult, best_of, read_results, 
 from chronoscene.io.log import Log
 from chronoscene.io.staging import alone_in
 from chronoscene.methods import as_typed, load_spec
+from chronoscene.methods.options import idle_options
 from chronoscene.methods.search_space import draw, starting_point
 
 if TYPE_CHECKING:
@@ -134,6 +135,11 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
     method = resolve_method(reference, load_spec(reference), run)
     strategies = settings.strategies or (method.spec.strategy,)
     settings = replace(settings, strategies=strategies)
+    searched = dict(method.spec.search)
+    for name, needed in idle_options(method.config).items():
+        if searched.pop(name, None) is not None:
+            log(f"{name} is not searched: it has no effect without {needed}")
+    method = replace(method, spec=replace(method.spec, search=searched))
     start = starting_point(method.spec, method.config)
     ours = _about(settings, method, log)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -287,13 +293,16 @@ def _finish(
     from optuna.trial import TrialState
 
     runs = [records.read_run(folder) for folder in finished]
-    values = [run.aggregates["macro"].get("psnr", math.nan) for run in runs]
-    value = sum(values) / len(values) if values else math.nan
+    value, ssim = (
+        sum(run.aggregates["macro"].get(name, math.nan) for run in runs) / (len(runs) or math.nan)
+        for name in ("psnr", "ssim")
+    )
     unscored = [f"{run.scene}: {run.skipped['psnr']}" for run in runs if "psnr" in run.skipped]
     reason = "; ".join([*reasons, *unscored])
     if not reason and not math.isfinite(value):
         reason = f"PSNR is {value}"
     for name, found in (
+        ("ssim", None if reason or math.isnan(ssim) else ssim),
         ("seconds", sum(run.seconds or 0.0 for run in runs)),
         ("bytes", sum(run.checkpoint_bytes or 0 for run in runs)),
         ("device", "; ".join(sorted({run.device for run in runs}))),

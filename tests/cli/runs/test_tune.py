@@ -19,7 +19,8 @@ def test_a_search_and_its_preset(make_scene_folder, tmp_path, runs_here, monkeyp
     done = chronoscene(*call, "--trials", 1)
     assert done.exit_code == 0, done.stderr
     assert "trial 0:" in done.stderr and "1 of 1 runs" in done.stderr
-    assert "PSNR on validation views; the first trial is the preset" in done.stdout
+    assert "PSNR and SSIM on validation views; the first trial is the preset" in done.stdout
+    assert "PSNR" in (heads := done.stdout.splitlines()[2]) and "SSIM" in heads
     assert f"wrote {out / 'preset.toml'}" in done.stderr
     more = chronoscene(*call, "--trials", 2)
     assert more.exit_code == 0, more.stderr

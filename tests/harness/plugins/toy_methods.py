@@ -40,6 +40,12 @@ class NoConfig(Config):
             raise ConfigError("ballast", expected="none", found="some", todo="leave it out")
 
 
+@dataclass(frozen=True)
+class IdleConfig(Config):
+    def without_effect(self):
+        return {"ballast": "a keel"}
+
+
 class MeanColour:
     """One colour per period, moved towards the mean of one image after another.
 
@@ -211,6 +217,7 @@ EVEN = replace(TUNED, name="even", config="toy_methods:EvenConfig")
 NONE = replace(
     TUNED, name="none", config="toy_methods:NoConfig", search={"ballast": Range(0, 9_999, "int")}
 )
+IDLE = replace(TUNED, name="idle", config="toy_methods:IdleConfig")
 FIXED = spec("fixed", FixedPeriods)
 DRAWING = spec("drawing", Drawing)
 DATED = replace(spec("dated", MeanColour), per_period=("balanced",))

@@ -22,14 +22,20 @@ pytest.importorskip("optuna")
 
 
 @pytest.fixture
-def search(scene_folder, tmp_path, monkeypatch):
+def lines():
+    """What searches say."""
+    return []
+
+
+@pytest.fixture
+def search(scene_folder, tmp_path, monkeypatch, lines):
     """Search in this process; returns the results."""
     monkeypatch.setattr("chronoscene.harness.train.worker.warm_up", lambda *args, **options: None)
 
     def run(out, trials=3, *, execute=execute_here, method="toy_methods:TUNED", **changes):
         fields = {"scenes": (scene_folder,), "methods": (method,), "runs": tmp_path / out}
         fields |= {"threads": 1, **changes}
-        return tune(bench_settings(**fields), trials, lambda line: None, execute=execute)
+        return tune(bench_settings(**fields), trials, lines.append, execute=execute)
 
     return run
 
@@ -113,12 +119,14 @@ def test_the_first_trial_is_the_preset_and_the_best_one_becomes_a_preset(
 
     (folder,) = bench_here("toy_methods:TUNED", preset=str(path), validation=True)[0].finished
     assert folder.parent.name == "tuned-joint-preset-validation=true"
-    assert read_run(folder).aggregates["macro"]["psnr"] == best.psnr
+    macro = read_run(folder).aggregates["macro"]
+    assert (macro["psnr"], macro["ssim"]) == (best.psnr, best.ssim)
     (again,) = bench_here("toy_methods:TUNED", preset=str(path), validation=True)[0].finished
     assert again == folder
 
     rows = list(csv.DictReader((tmp_path / "out/trials.csv").open()))
     assert [float(row["psnr"]) for row in rows] == [result.psnr for result in results]
+    assert [float(row["ssim"]) for row in rows] == [result.ssim for result in results]
     kept = {p.name for p in (tmp_path / "out/trials").rglob("*") if p.is_file()}
     assert {"run.json", "results.json"} <= kept and not any("png" in name for name in kept)
 
@@ -129,7 +137,8 @@ def test_failed_trials_count(search):
 
     results = search("out", execute=failing)
     assert [result.failure for result in results] == ["", "too bad", ""]
-    assert results[1].psnr is None and best_of(results) is not results[1]
+    assert results[1].psnr is None and results[1].ssim is None
+    assert best_of(results) is not results[1]
     assert search("out") == results
     with pytest.raises(ConfigError, match=r"expected a trial with a result, found none.*too bad"):
         search("none", 2, execute=lambda job: job.failure("too bad"))
@@ -144,6 +153,13 @@ def test_options_that_the_method_refuses_are_a_failed_trial(search, tmp_path):
     rows = list(csv.DictReader((tmp_path / "out/trials.csv").open()))
     assert [row["failure"] for row in rows] == [result.failure for result in results]
     assert search("out", 8, method="toy_methods:EVEN") == results
+
+
+def test_options_without_effect_in_the_preset_are_not_searched(search, lines):
+    results = search("out", 4, method="toy_methods:IDLE")
+    assert not any(result.failure for result in results)
+    assert [*results[0].options] == ["rate", "sleep"]
+    assert "ballast is not searched: it has no effect without a keel" in lines
 
 
 def test_a_search_ends_where_the_method_refuses_everything(search, tmp_path):
