@@ -27,6 +27,10 @@ class ChronoGSConfig(AnchorConfig):
     """Share by which the loss may rise, by estimate, where features of an anchor at several periods
     become one once growth is over, as they are alike: see `chronoscene.anchors.blocks`. 0: none
     (paper and code)."""
+    period_decay: NonNegativeFloat = 0.0
+    """Decay of an anchor's features of the periods towards their mean, in multiples of their
+    learning rate per view: they differ only where the photos do, and elsewhere learn from the
+    photos of all periods. 0: none (paper and code)."""
     fusion: Literal["concat", "sum"] = "concat"
     """``concat``: base, period and global feature side by side (code); ``sum``: added (formula of
     the paper; needs equal lengths)."""

@@ -32,5 +32,9 @@ class ChronoGS(AnchorMethod):
     def merge_share(self) -> float:
         return self.config.merge_share
 
+    @property
+    def period_decay(self) -> float:
+        return self.config.period_decay
+
     def rates(self, extent: float) -> dict[str, tuple[float, float]]:
         return super().rates(extent) | {"global_features": self.config.global_lr}

@@ -11,7 +11,10 @@ h L / N, so that the loss rises by the share
 With w summed over the views of a period, the least rise for one block instead of those of periods
 s and t is w_s w_t / (w_s + w_t) |b_s - b_t|^2, with their weighted mean: the linkage of Ward. A
 period that does not see an anchor has no weight, and takes over the block of a neighbour that does.
-Not in the paper.
+
+Blocks may also decay towards the mean of their anchor, from the start of the training: those that
+the photos do not tell apart become alike, and learn from the photos of all periods. Neither is in
+the paper.
 """
 
 from __future__ import annotations
@@ -107,6 +110,24 @@ def unpack_blocks(tensors: dict[str, Tensor], periods: int) -> dict[str, Tensor]
 def _leads(first: Tensor) -> Tensor:
     """Return True for periods that are the first to have their block. bool [A, T]"""
     return first == torch.arange(first.shape[1], device=first.device)
+
+
+def decay_to_mean(blocks: Tensor, block_rows: Tensor, share: float) -> None:
+    """Move blocks in place towards their mean over the periods of an anchor, which stays.
+
+    Args:
+        blocks: [B, Fv]
+        block_rows: Block of an anchor at a period. int64 [A, T]
+        share: Part of the way, 0..1.
+    """
+    mean = blocks[block_rows[:, 0]]
+    for rows in block_rows.T[1:]:
+        mean += blocks[rows]
+    mean /= block_rows.shape[1]
+    target = torch.empty_like(blocks)
+    for rows in block_rows.T:
+        target[rows] = mean
+    blocks.lerp_(target, share)
 
 
 class BlockStatistics(AnchorCounters):

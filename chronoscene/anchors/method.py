@@ -48,6 +48,11 @@ class AnchorMethod(SplattingMethod):
         """Share by which the loss may rise where periods come to share blocks; 0: none."""
         return 0.0
 
+    @property
+    def period_decay(self) -> float:
+        """Decay of blocks towards the mean of their anchor, in learning rates per view."""
+        return 0.0
+
     def feature_rows(self, train: TrainingSet) -> NDArray[np.int64]:
         """Return the row of the varying features of each training view; here its period. [V]"""
         return np.array([view.period for view in train.views])
@@ -132,6 +137,7 @@ class AnchorMethod(SplattingMethod):
             rates=self.rates(self.extent(train)),
             feature_rows=self.feature_rows(train),
             merge_share=self.merge_share,
+            period_decay=self.period_decay,
         )
 
     def device_memory(self, points: int, periods: int, pixels: int) -> tuple[int, dict[str, int]]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from chronoscene.anchors.blocks import own_blocks
+from chronoscene.anchors.blocks import decay_to_mean, own_blocks
 from chronoscene.anchors.density import AnchorRows
 from chronoscene.anchors.model import FIXED, PER_ANCHOR, TABLES, AnchorModel
 from chronoscene.training.checkpoint import parts
@@ -179,6 +179,12 @@ class AnchorOptimizer:
         self.keep_blocks(model.block_rows[mask])
         if model.used_offsets is not None:
             model.used_offsets = model.used_offsets[mask]
+
+    @torch.no_grad()
+    def decay_blocks(self, share: float) -> None:
+        """Move the blocks of each anchor towards their mean by a share of the way."""
+        self.tables["blocks"].flush()
+        decay_to_mean(self.model.blocks, self.model.block_rows, share)
 
     def keep_blocks(self, block_rows: Tensor) -> None:
         """Give the anchors these blocks, and forget those that no anchor has. int64 [A, T]"""

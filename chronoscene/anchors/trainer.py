@@ -33,7 +33,16 @@ from chronoscene.training.losses import mean_volume, training_loss
 from chronoscene.training.optimizers.adam import Pace
 from chronoscene.training.optimizers.summing import Part
 from chronoscene.training.schedules import learning_rates
-from chronoscene.training.views import PhotosOnDevice, ViewSampler, count_views, views_of_step
+from chronoscene.training.views import (
+    PhotosOnDevice,
+    ViewSampler,
+    count_views,
+    is_due,
+    views_of_step,
+)
+
+_DECAY_INTERVAL = 10
+"""Views between two decays, which read the blocks of all anchors."""
 
 Learned = tuple[BackwardPass, Tensor, Tensor, RasterInfo]
 """Outcome, places [L] and opacities [L] of the Gaussians that are switched on, and details of the
@@ -83,6 +92,8 @@ class AnchorTrainer:
     """Row of the varying features of each view, mostly its period. [V]"""
     merge_share: float = 0.0
     """See `DensityControl`."""
+    period_decay: float = 0.0
+    """Decay of blocks towards the mean of their anchor, in learning rates per view."""
 
     def __post_init__(self) -> None:
         model, train, seed = self.model, self.train, self.seed
@@ -131,6 +142,8 @@ class AnchorTrainer:
         else:
             self._update(learned, done, resized=False)
             self.density.round(index, count, done)
+        if is_due(index, count, _DECAY_INTERVAL):
+            self._decay(done)
         self.optimizer.adam.zero_grad()
         result = joined([view.result for view in passes])
         return StepReport(result.loss, len(self.model), result.skipped, result.not_finite, count)
@@ -141,6 +154,14 @@ class AnchorTrainer:
             rates = learning_rates(self.rates, done, cooldown=self.config.cooldown)
             self.optimizer.step(rates, resized=resized)
             self.exposure.step(done)
+
+    def _decay(self, done: float) -> None:
+        """Let the periods of each anchor become more alike, where that is asked for."""
+        if not self.period_decay or self.model.block_rows.shape[1] < 2:
+            return
+        rates = {"blocks": self.rates["blocks"]}
+        rate = learning_rates(rates, done, cooldown=self.config.cooldown)["blocks"]
+        self.optimizer.decay_blocks(min(self.period_decay * rate * _DECAY_INTERVAL, 1.0))
 
     def _progress_after(self, index: int, count: int, progress: float) -> float:
         """Return the share of the training that is over once this step is done."""

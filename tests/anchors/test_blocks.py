@@ -14,6 +14,7 @@ from chronoscene.anchors.blocks import (
     BlockStatistics,
     agglomerate,
     count_sharing,
+    decay_to_mean,
     leaders,
     merge_alike,
     pack_blocks,
@@ -59,6 +60,20 @@ def test_what_periods_share_is_counted(anchors: int, periods: int, seed: int) ->
             alone[period] += row.count(block) == 1
     found = count_sharing(rows)
     assert [counts.tolist() for counts in found] == [by_blocks, alone]
+
+
+@settings(max_examples=50)
+@given(st.integers(1, 6), st.integers(2, 7), st.integers(0, 1000), st.floats(0.0, 1.0))
+def test_blocks_decay_to_the_mean_of_their_anchor(
+    anchors: int, periods: int, seed: int, share: float
+) -> None:
+    count, rows = shared_rows(anchors, periods, seed)
+    blocks = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    before = blocks[rows].double().numpy()
+    mean = before.mean(axis=1, keepdims=True)
+    decay_to_mean(blocks, rows, share)
+    expected = mean + (1 - share) * (before - mean)
+    np.testing.assert_allclose(blocks[rows].numpy(), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("periods", [256, 257, 1000])

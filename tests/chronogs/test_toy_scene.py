@@ -201,6 +201,20 @@ def test_where_nothing_changes_no_anchor_keeps_a_block_of_its_own() -> None:
     check_sharing(sharing, made.size(), "sharing")
 
 
+@pytest.mark.parametrize(("periods", "decay"), [((1, 1), 3.0), ((0, 1), 0.3)])
+def test_a_decay_makes_periods_alike_where_their_photos_are(
+    periods: tuple[int, int], decay: float
+) -> None:
+    options = {**LEAN, "merge_share": 0.0}
+    free, bound = (train(periods, steps=300, period_decay=d, **options) for d in (0.0, decay))
+    if periods == (1, 1):
+        spread = [made.model.blocks[made.model.block_rows].std(1).mean() for made in (free, bound)]
+        assert spread[1] < 0.5 * spread[0]
+    for label, period in enumerate(periods):
+        assert psnr(bound, period, label) > psnr(free, period, label) - 0.4
+    assert psnr(bound, 1, 1, box_of_period_1) > psnr(free, 1, 1, box_of_period_1) - 1.2
+
+
 def test_a_period_with_one_image_shows_what_the_others_saw() -> None:
     everything = training_set((0, 0, 0))
     kept = [i for i, v in enumerate(everything.views) if v.period != 1 or i == 30]

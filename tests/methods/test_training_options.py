@@ -29,6 +29,7 @@ OPTIONS = [
     ("chronogs", {"exposure": "period"}),
     ("chronogs", {"unused_share": 0.05, "cooldown": 0.2}),
     ("chronogs", {"merge_share": 0.5, "density_interval": 8}),
+    ("chronogs", {"period_decay": 3.0, "views_per_step": 2}),
     ("4dgs", {"exposure": "period", "cooldown": 0.5}),
     ("gs-w", {"reference": "period", "exposure": "image"}),
     ("3dgs", {"views_per_step": 2, "densify_interval": 8}),
