@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
+from importlib.metadata import EntryPoint
 from typing import Any
 
 from chronoscene.errors import ChronoSceneError, ConfigError, ShapeError
@@ -62,4 +63,26 @@ def import_extra(package: str, extra: str, place: str) -> Any:
             expected=f"the package {package}",
             found=str(error),
             todo=f"pip install 'chronoscene[{extra}]'",
+        ) from error
+
+
+def load_entry(entry: EntryPoint, place: str) -> Any:
+    """Import what an entry point names; its package may be of another version, or broken.
+
+    Args:
+        entry: Entry point of an installed package.
+        place: Kind and name of the plug-in, such as ``method mine``.
+
+    Raises:
+        ConfigError: If the import fails.
+    """
+    try:
+        return entry.load()
+    except Exception as error:  # whatever the code of others raises
+        package = entry.dist.name if entry.dist else entry.module
+        raise ConfigError(
+            place,
+            expected=f"{entry.value}, which the package {package} names",
+            found=f"{type(error).__name__}: {error}",
+            todo=f"install what {package} needs, or another version of it, or uninstall it",
         ) from error

@@ -21,11 +21,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from chronoscene.checks import check_choice
+from chronoscene.checks import check_choice, load_entry
 from chronoscene.colmap.raw_model import FoundModel, find_model, find_stray_model
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Scene
@@ -45,6 +45,9 @@ FORMATS = {
 ENTRY_POINT_GROUP = "chronoscene.formats"
 """Other packages name modules in it."""
 
+REQUIRED = ("NAME", "MARKS", "matches", "read")
+"""Names that the module of a format must define."""
+
 USUAL = ("sparse/0", "sparse")  # Where everybody looks for a COLMAP model
 
 COLMAP = "colmap-folders"
@@ -55,24 +58,37 @@ FAR_UP = 4
 
 
 @cache
-def installed_formats() -> dict[str, str]:
-    """`FORMATS` and those of other packages."""
-    return {e.name: e.value for e in entry_points(group=ENTRY_POINT_GROUP)} | FORMATS
+def _plugins() -> dict[str, EntryPoint]:
+    """Formats of other packages, by name."""
+    return {e.name: e for e in entry_points(group=ENTRY_POINT_GROUP) if e.name not in FORMATS}
 
 
 def format_names() -> tuple[str, ...]:
     """Names of all formats, sorted."""
-    return tuple(sorted(installed_formats()))
+    return tuple(sorted({*FORMATS, *_plugins()}))
 
 
 def load_format(name: str) -> Any:
     """Load the module of a format.
 
     Raises:
-        ConfigError: If the format is unknown; lists the known ones.
+        ConfigError: If the format is unknown; lists the known ones. Or if it is of another package,
+            and cannot be imported or lacks something.
     """
-    check_choice("dataset format", name, installed_formats())
-    return import_module(installed_formats()[name])
+    place = f"dataset format {name}"
+    check_choice("dataset format", name, format_names())
+    if name in FORMATS:
+        return import_module(FORMATS[name])
+    module = load_entry(_plugins()[name], place)
+    lacking = [needed for needed in REQUIRED if not hasattr(module, needed)]
+    if lacking or name != module.NAME:
+        raise ConfigError(
+            place,
+            expected=f"a module with {', '.join(REQUIRED)}, whose NAME is that of its entry point",
+            found=f"no {lacking[0]}" if lacking else f"NAME = {module.NAME!r}",
+            todo="correct the package as docs/guides/adding-a-format.md describes, or uninstall it",
+        )
+    return module
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +106,7 @@ class DetectedFormat:
     @property
     def module(self) -> Any:
         """Return the module of the format."""
-        return import_module(installed_formats()[self.name])
+        return load_format(self.name)
 
     @property
     def options(self) -> dict[str, str]:

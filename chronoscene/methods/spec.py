@@ -11,7 +11,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-from chronoscene.checks import check_choice, nearest
+from chronoscene.checks import check_choice, load_entry, nearest
 from chronoscene.errors import ConfigError
 
 PeriodInput = Literal["none", "label", "continuous"]
@@ -193,20 +193,6 @@ def _entries(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     return tuple(entry_points(group=group))
 
 
-def _loaded(entry: EntryPoint) -> Any:
-    """Import what an entry point names; its package may be of another version, or broken."""
-    try:
-        return entry.load()
-    except Exception as error:  # whatever the code of others raises
-        package = entry.dist.name if entry.dist else entry.module
-        raise ConfigError(
-            f"method {entry.name}",
-            expected=f"{entry.value}, which the package {package} names",
-            found=f"{type(error).__name__}: {error}",
-            todo=f"install what {package} needs, or another version of it, or uninstall it",
-        ) from error
-
-
 def load_spec(name: str) -> MethodSpec:
     """Find a method by its name, or by ``module:SPEC`` while it is being developed.
 
@@ -219,7 +205,7 @@ def load_spec(name: str) -> MethodSpec:
     else:
         installed = installed_methods()
         check_choice("--method", name, installed)
-        spec = _loaded(installed[name])
+        spec = load_entry(installed[name], f"method {name}")
     if not isinstance(spec, MethodSpec):
         raise ConfigError(
             name, expected="a MethodSpec", found=type(spec).__name__, todo="name its SPEC object"

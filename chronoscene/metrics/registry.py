@@ -13,7 +13,7 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from chronoscene.checks import check_choice
+from chronoscene.checks import check_choice, load_entry
 from chronoscene.errors import ConfigError, MetricUnavailableError
 from chronoscene.metrics.color_correction import psnr_cc, ssim_cc
 from chronoscene.metrics.flip import flip
@@ -134,11 +134,11 @@ def all_metrics() -> dict[str, MetricInfo]:
     """`METRICS` and those of other packages, in the order of tables.
 
     Raises:
-        ConfigError: If one of these is not what it should be.
+        ConfigError: If one of these cannot be imported, or is not what it should be.
     """
     found = dict(METRICS)
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda e: e.name):
-        info = entry.load()
+        info = load_entry(entry, f"metric {entry.name}")
         if not isinstance(info, MetricInfo) or info.function is None or info.name != entry.name:
             raise ConfigError(
                 f"{ENTRY_POINT_GROUP}: {entry.name}",

@@ -4,6 +4,7 @@ import pytest
 from installed import install
 
 from chronoscene import formats
+from chronoscene.errors import ConfigError
 from chronoscene.formats import detect, format_names, read_scene, writable_formats
 
 PLUG_IN = """
@@ -29,17 +30,22 @@ def write(scene, out, **options):
 
 
 @pytest.fixture
-def toy(tmp_path, monkeypatch):
-    install(
-        monkeypatch, tmp_path, {"toy_format": PLUG_IN}, "chronoscene.formats", {"toy": "toy_format"}
-    )
-    formats.installed_formats.cache_clear()
-    yield
+def install_format(tmp_path, monkeypatch):
+    """Install a format by its entry point."""
+
+    def add(source):
+        module = f"format_of_{tmp_path.name}"
+        entries = {"toy": module}
+        install(monkeypatch, tmp_path, {module: source}, "chronoscene.formats", entries)
+        formats._plugins.cache_clear()
+
+    yield add
     monkeypatch.undo()
-    formats.installed_formats.cache_clear()
+    formats._plugins.cache_clear()
 
 
-def test_a_format_of_another_package(toy, tmp_path, make_scene_folder):
+def test_a_format_of_another_package(install_format, tmp_path, make_scene_folder):
+    install_format(PLUG_IN)
     assert "toy" in format_names() and "toy" in writable_formats()
     scene = make_scene_folder({"a/0.png": 0, "b/0.png": 1})
     folder = tmp_path / "toys"
@@ -47,3 +53,17 @@ def test_a_format_of_another_package(toy, tmp_path, make_scene_folder):
     (folder / "toy.txt").write_text(str(scene))
     assert detect(folder).name == "toy"
     assert read_scene(folder).num_periods == 2
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("import no_such_package", "which the package plug-in names, found ModuleNotFoundError: "),
+        (PLUG_IN.replace("def read", "def load"), "found no read; correct the package"),
+        (PLUG_IN.replace('"toy", "toy', '"toys", "toy'), "found NAME = 'toys'; correct"),
+    ],
+)
+def test_a_broken_format_is_named(install_format, make_scene_folder, source, message):
+    install_format(source)
+    with pytest.raises(ConfigError, match=f"^dataset format toy: expected .*{message}"):
+        read_scene(make_scene_folder())

@@ -64,3 +64,9 @@ def test_a_metric_under_another_name_is_refused(plug_in):
         ConfigError, match=r"chronoscene\.metrics: l1: expected a MetricInfo of the"
     ):
         all_metrics()
+
+
+def test_a_metric_that_cannot_be_imported_is_named(plug_in):
+    plug_in({"gone": "mae_metric:GONE"})
+    with pytest.raises(ConfigError, match=r"^metric gone: .* package plug-in names, found Attrib"):
+        all_metrics()

@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal
 
+from chronoscene.checks import load_entry
 from chronoscene.errors import ConfigError
 from chronoscene.io.documents import plain_file
 from chronoscene.io.staging import sha256_of
@@ -96,7 +97,7 @@ def load_plugin(option: str, source: Source) -> Any:
     """Load the object of an entry point."""
     for entry in entry_points(group=GROUPS[option]):
         if entry.name == source.place:
-            return entry.load()
+            return load_entry(entry, f"{option} {entry.name}")
     raise wrong(source.place, "an installed plug-in", "none of this name", "install it again")
 
 
