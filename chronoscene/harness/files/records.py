@@ -14,6 +14,7 @@ import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -243,7 +244,18 @@ def read_run(folder: Path) -> RunRecord:
         CheckpointError: If it is missing or damaged.
     """
     path = folder / RUN_FILE
-    return read_document(path, RunRecord, expected="a finished run", todo="run bench first")
+    if not path.exists():
+        found, todo = "no such file", "run bench first"
+        patterns = [f"{'*/' * depth}seed*/{RUN_FILE}" for depth in range(3)]
+        below = sorted(chain(*map(folder.glob, patterns)))
+        if folder.is_file():
+            found, todo = "a file in place of the folder", f"name {folder.parent}"
+        elif (failure := read_failure(folder)) is not None:
+            found, todo = f"a run that failed: {failure.reason}", "run bench again"
+        elif below:
+            found, todo = "a folder of runs", f"name one of them, such as {below[0].parent}"
+        raise CheckpointError(path, expected="a finished run", found=found, todo=todo)
+    return read_document(path, RunRecord, expected="a finished run")
 
 
 def read_config(folder: Path) -> dict[str, Any]:

@@ -9,11 +9,13 @@ import pytest
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files.records import (
+    Failure,
     ViewScore,
     no_runs,
     read_rows,
     read_run,
     run_folders,
+    write_failure,
     write_run,
     write_summary,
 )
@@ -91,6 +93,19 @@ def test_damaged_rows_are_named(runs):
 def test_missing_runs_are_named(tmp_path):
     with pytest.raises(CheckpointError, match="no such file; run bench first"):
         read_run(tmp_path)
+    failed, done = tmp_path / "plaza/3dgs/seed0", tmp_path / "plaza/4dgs/seed0"
+    failed.mkdir(parents=True)
+    failure = {"method": "3dgs", "strategy": "", "preset": "", "scene": "plaza", "seed": 0}
+    write_failure(failed, Failure(**failure, reason="out of memory"))
+    with pytest.raises(CheckpointError, match="found a run that failed: out of memory; run bench"):
+        read_run(failed)
+    done.mkdir(parents=True)
+    (done / "run.json").touch()
+    for folder in (tmp_path, tmp_path / "plaza", done.parent):
+        with pytest.raises(CheckpointError, match=f"a folder of runs; name .* such as {done}$"):
+            read_run(folder)
+    with pytest.raises(CheckpointError, match=f"a file in place of the folder; name {done}$"):
+        read_run(done / "run.json")
 
 
 def test_all_keys_and_columns_are_in_the_documentation(finished_bench):
