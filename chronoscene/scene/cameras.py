@@ -119,6 +119,8 @@ class Camera:
         """True if size and parameters are plausible and finite, focal lengths positive."""
         if not (1 <= self.width <= MAX_SIDE and 1 <= self.height <= MAX_SIDE):
             return False
+        if len(self.params) != len(CAMERA_MODELS[self.model].params):
+            return False
         if not np.isfinite(self.params).all():
             return False
         return self.model == "EQUIRECTANGULAR" or bool((self.K[[0, 1], [0, 1]] > 0).all())

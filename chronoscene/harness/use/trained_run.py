@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from chronoscene.arrays import Array
-from chronoscene.errors import CheckpointError, ConfigError, SceneError
+from chronoscene.checks import check_choice, check_shape
+from chronoscene.errors import CheckpointError, ConfigError, SceneError, ShapeError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.records import (
@@ -38,8 +40,11 @@ from chronoscene.methods import (
     make_method,
 )
 from chronoscene.scene import Camera, Frame, Scene
+from chronoscene.scene.cameras import CAMERA_MODELS
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.similarity import Sim3
+
+NOT_RIGID = 1e-3  # Deviation from a rotation beyond which a pose is refused
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,8 @@ class TrainedRun:
             ConfigError: If it is not one of theirs, or fractional where the method takes whole
                 ones only.
         """
+        if not isinstance(period, Real):  # a label, which `parse_period` takes
+            raise self._no_period(repr(period))
         if not 0 <= period <= self.num_periods - 1:
             raise self._no_period(f"{period:g}")
         if period != int(period) and not self.is_continuous:
@@ -178,16 +185,38 @@ class TrainedRun:
         """Return a camera with its pose [4, 4] in the training frame.
 
         Raises:
-            ConfigError: If the camera has distortion.
+            ConfigError: If the camera has distortion, or is none.
+            ShapeError: If the pose is none.
         """
+        place = f"camera {camera.camera_id}"
+        model = CAMERA_MODELS[check_choice(f"{place}: model", camera.model, CAMERA_MODELS)]
+        if not camera.is_usable:
+            raise ConfigError(
+                place,
+                expected=f"a width, a height and the parameters {', '.join(model.params)}, with "
+                "positive focal lengths",
+                found=f"{camera.width}, {camera.height} and {camera.params}",
+                todo="correct the camera",
+            )
         if not camera.is_pinhole:
             raise ConfigError(
-                f"camera {camera.camera_id}",
+                place,
                 expected="a pinhole camera without distortion",
                 found=camera.model,
                 todo="use chronoscene.scene.cameras.undistorted_camera",
             )
-        pose = self.training_from_world.apply_to_pose(cam_from_world)
+        pose = np.asarray(cam_from_world, np.float64)
+        check_shape("cam_from_world", pose, (4, 4))
+        squared = pose[:3, :3] @ pose[:3, :3].T
+        is_rigid = np.allclose(squared, np.eye(3), atol=NOT_RIGID)
+        if not (is_rigid and np.isfinite(pose).all() and pose[3].tolist() == [0, 0, 0, 1]):
+            raise ShapeError(
+                "cam_from_world",
+                expected="[[R, t], [0, 1]] with a rotation R and a finite translation t",
+                found=str(pose.tolist()),
+                todo="pass a transform from the world to the camera, without a scale",
+            )
+        pose = self.training_from_world.apply_to_pose(pose)
         return View(camera.K, camera.width, camera.height, pose)
 
     def photos(self, scene: Scene) -> ImageStore:
@@ -222,6 +251,7 @@ class TrainedRun:
         Raises:
             ConfigError: If the camera has distortion, the period is not one of the run, or the
                 method cannot combine two periods.
+            ShapeError: If the pose is not a rotation and a translation.
 
         Example:
             >>> run = open_run("runs/plaza/chronogs-joint-balanced/seed0")
@@ -324,15 +354,15 @@ class TrainedRun:
             return read_views(staged, truth, fitted=self.record.fitted, stage=True)
         return read_views(self.folder / PREDICTIONS, truth, fitted=self.record.fitted)
 
-    def scene(self, root: Path | None = None) -> Scene:
+    def scene(self, root: str | Path | None = None) -> Scene:
         """Read the scene that the run was trained on, from ``root`` if it has moved.
 
         Raises:
             SceneError: If it is missing, cannot be read, or is another one.
         """
-        place, found = root or Path(self.source.scene_root), "nothing"
+        place, found = Path(root or self.source.scene_root), "nothing"
         if place.exists():
-            scene = self.source.read_scene(root)
+            scene = self.source.read_scene(place)
             if scene_hash(scene) == self.record.scene_hash:
                 return scene
             found = "another scene, or a changed one"
@@ -367,9 +397,10 @@ def open_run(
     Raises:
         CheckpointError: If the folder has no finished run, or a file is damaged.
         ConfigError: If the method is neither installed nor in ``plugin``, or there is no such
-            stage.
-        BackendError: If there is no such device.
+            stage or device.
+        BackendError: If this machine lacks the device.
     """
+    check_choice("device", device, ("cpu", "cuda"))
     folder = Path(folder)
     record = read_run(folder)
     if stage is not None:

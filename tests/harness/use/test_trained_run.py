@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chronoscene.errors import CheckpointError, ConfigError, SceneError
+from chronoscene.errors import CheckpointError, ConfigError, SceneError, ShapeError
 from chronoscene.harness.files.predictions import load_image, read_manifest, to_bytes
 from chronoscene.harness.files.records import CONFIG_FILE, PREDICTIONS, SOURCE_FILE
 from chronoscene.harness.plan.settings import bench_settings
 from chronoscene.harness.run.runner import run_bench
 from chronoscene.harness.use.trained_run import TrainedRun, open_run
+from chronoscene.scene import Camera
+from chronoscene.scene.geometry import pose_from_rotation_translation
 
 TOY = "toy_methods:MEAN"
 STRATEGIES = ("joint", "pooled", "separate")
@@ -63,7 +65,7 @@ def test_the_scene_may_have_moved(runs, scene_folder, tmp_path):
     with pytest.raises(SceneError, match=r"old: expected the scene .* found nothing; .* --scene"):
         run.scene()
     moved = shutil.copytree(scene_folder, tmp_path / "moved")
-    assert run.scene(moved).name == "moved"
+    assert run.scene(str(moved)).name == "moved"
     (moved / "images/a/0.png").write_bytes((moved / "images/a/1.png").read_bytes())
     with pytest.raises(SceneError, match=r"found another scene, or a changed one; .* --scene"):
         run.scene(moved)
@@ -121,6 +123,7 @@ def test_a_label_of_two_periods_names_neither(runs):
         ("joint", 2, "period 2: expected one from 0 to 1.*0 .spring., 1 .autumn."),
         ("joint", -1, "period -1: expected one from 0 to 1"),
         ("joint", float("nan"), "period nan: expected one from 0 to 1"),
+        ("joint", "autumn", "period 'autumn': expected one from 0 to 1.*1 .autumn."),
         ("joint", 0.5, "a whole number: Mean under strategy joint.*choose 0 or 1"),
         ("separate", 0.5, "a whole number"),
         ("pooled", 0.5, "a whole number"),
@@ -131,6 +134,50 @@ def test_a_period_that_the_models_do_not_claim(runs, strategy, period, message):
     frame = run.scene().frames[0]
     with pytest.raises(ConfigError, match=message):
         run.render(frame.camera, frame.cam_from_world, period)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"model": "PINHOL"}, "camera 1: model: expected one of .* did you mean 'PINHOLE'"),
+        (
+            {"params": (9.0, 2.0, 2.0)},
+            "parameters fx, fy, cx, cy, with positive focal lengths, fou",
+        ),
+        ({"params": (9.0, 0.0, 2.0, 2.0)}, r"found 40, 30 and \(9.0, 0.0, 2.0, 2.0\); correct"),
+        (
+            {"width": 0},
+            "camera 1: expected a width, a height and the parameters .* found 0, 30 and",
+        ),
+    ],
+)
+def test_a_camera_that_is_none(runs, change, message):
+    run = open_run(folder_of(runs), plugin=TOY)
+    camera = replace(Camera(1, "PINHOLE", 40, 30, (9.0, 9.0, 20.0, 15.0)), **change)
+    with pytest.raises(ConfigError, match=message):
+        run.render(camera, np.eye(4), 0)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (np.eye(4)[:3], r"expected shape \[4, 4\], found \[3, 4\]"),
+        (np.diag([2.0, 2, 2, 1]), "expected .* a rotation R and a finite translation t, found"),
+        (np.full((4, 4), np.nan), "without a scale"),
+        (pose_from_rotation_translation(np.eye(3), [0, 0, np.inf]), "without a scale"),
+        (pose_from_rotation_translation(np.eye(3), [0, 0, 9]).T, "without a scale"),
+    ],
+    ids=["3 x 4", "scaled", "not a number", "infinite", "transposed"],
+)
+def test_a_pose_that_is_none(runs, pose, message):
+    run = open_run(folder_of(runs), plugin=TOY)
+    with pytest.raises(ShapeError, match=f"^cam_from_world: .*{message}"):
+        run.render(Camera(1, "PINHOLE", 40, 30, (9.0, 9.0, 20.0, 15.0)), pose, 0)
+
+
+def test_a_device_that_is_none(runs):
+    with pytest.raises(ConfigError, match="device: expected one of cpu, cuda, found 'auto'"):
+        open_run(folder_of(runs), plugin=TOY, device="auto")
 
 
 @pytest.mark.parametrize(("strategy", "claims"), [("joint", True), ("separate", False)])
