@@ -8,13 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chronoscene.checks import check_choice
-from chronoscene.errors import ChronoSceneError, SceneError
+from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 from chronoscene.formats import read_scene
-from chronoscene.harness.files.records import ROWS_FILE, Failure, read_with_rows
+from chronoscene.harness.files.records import (
+    ROW_COLUMNS,
+    ROWS_FILE,
+    RUN_COLUMNS,
+    Failure,
+    read_with_rows,
+)
 from chronoscene.harness.plan.settings import PHOTO_MEMORY, bench_settings
 from chronoscene.harness.plan.stop import parse_duration
 from chronoscene.harness.report.summary import ENTRY_COLUMNS, summarise
@@ -57,8 +64,8 @@ __all__ = [
 def validate(
     path: str | Path,
     *,
-    select: Sequence[str] = (),
-    ignore: Sequence[str] = (),
+    select: str | Sequence[str] = (),
+    ignore: str | Sequence[str] = (),
     decode: bool = False,
     format: str | None = None,
     period_by: str | None = None,
@@ -67,8 +74,8 @@ def validate(
 
     Args:
         path: Folder of one scene.
-        select: Codes or names of the rules to run, such as ``CS201``, ``CS3`` or ``split-line``;
-            all if empty.
+        select: Codes or names of the rules to run, such as ``CS201``, ``CS3`` or ``split-line``,
+            or one of them; all if empty.
         ignore: Rules not to run.
         decode: Decode all images, which finds damaged and duplicate ones but takes time.
         format: Name of the dataset format; None to detect it.
@@ -86,7 +93,7 @@ def validate(
         >>> [f"{f.code} {f}" for f in report.findings if f.severity == "error"]
     """
     path = Path(path)
-    rules = choose_rules(select, ignore)
+    rules = choose_rules(_several(select), _several(ignore))
     if (found := find_folders(path)) != [path]:
         raise SceneError(
             path,
@@ -174,25 +181,29 @@ class BenchmarkResult:
     failures: tuple[Failure, ...]
     """Runs without a result; ``failure.reason`` names the error."""
 
-    def table(self, metrics: Sequence[str] = ()) -> DataFrame:
+    def table(self, metrics: str | Sequence[str] = ()) -> DataFrame:
         """Return means over seeds with spread and intervals, as ``chronoscene table`` shows them.
 
         Args:
-            metrics: Names of the metrics wanted; all if empty.
+            metrics: Names of the metrics wanted, or one of them; all if empty.
 
         Returns:
             One row per scene, method, quantity and column (``period 0``, ``macro``, ...);
             `chronoscene.harness.report.summary.ENTRY_COLUMNS` describes the columns.
         """
         records = [read_with_rows(folder) for folder in self.runs]
-        return summarise(records, metrics)[[*ENTRY_COLUMNS]]
+        return summarise(records, _several(metrics))[[*ENTRY_COLUMNS]]
 
     def rows(self) -> DataFrame:
         """Return the values of single test views: one row per run, view, region and metric."""
         import pandas as pd
 
-        tables = [pd.read_csv(folder / ROWS_FILE) for folder in self.runs]
-        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+        # Names stay text, also those that are numbers, and an empty variant stays empty.
+        numbers = {"seed": int, "camera_period": int, "rendered_period": int, "value": float}
+        kinds = dict.fromkeys((*RUN_COLUMNS, *ROW_COLUMNS), str) | numbers
+        read = partial(pd.read_csv, dtype=kinds, keep_default_na=False)
+        tables = [read(folder / ROWS_FILE) for folder in self.runs]
+        return pd.concat(tables or [pd.DataFrame(columns=[*kinds])], ignore_index=True)
 
 
 def bench(
@@ -256,9 +267,18 @@ def bench(
         >>> result = bench("data/plaza", ["chronogs", "3dgs"], out="runs", budget="90s")
         >>> result.table(["psnr"])
     """
+    if isinstance(seeds, int):
+        raise ConfigError(
+            "seeds", expected="seeds such as [0] or range(3)", found=repr(seeds), todo="list them"
+        )
+    folders = [Path(scene) for scene in ([scenes] if isinstance(scenes, str | Path) else scenes)]
+    methods, seeds = _several(methods), tuple(seeds)
+    for name, given in (("scenes", folders), ("methods", methods), ("seeds", seeds)):
+        if not given:
+            raise ConfigError(name, expected="at least one", found="none", todo="name some")
     settings = bench_settings(
-        map(Path, [scenes] if isinstance(scenes, str | Path) else scenes),
-        _several(methods),
+        folders,
+        methods,
         Path(out),
         preset=str(preset),
         overrides={key: as_typed(value) for key, value in (overrides or {}).items()},
@@ -270,7 +290,7 @@ def bench(
         threads=threads,
         device=device,
         strategies=_several(strategies),
-        seeds=tuple(seeds),
+        seeds=seeds,
         dataset_format=format,
         period_by=period_by,
         overwrite=overwrite,

@@ -15,6 +15,7 @@ import pytest
 
 import chronoscene as cs
 from chronoscene import api
+from chronoscene.harness.files.records import ROW_COLUMNS, RUN_COLUMNS
 from chronoscene.rasterizer import rasterize
 from chronoscene.training.spherical_harmonics import basis
 
@@ -132,6 +133,7 @@ def test_validate_wants_one_scene(in_folder):
         cs.validate("nowhere")
     with pytest.raises(cs.ChronoSceneError, match="CS999"):
         cs.validate(in_folder, select=["CS999"])
+    assert cs.validate(in_folder, select="CS3").is_valid
 
 
 @pytest.mark.parametrize(
@@ -146,6 +148,11 @@ def test_validate_wants_one_scene(in_folder):
         ({"budget": f"{10**400}h"}, "--budget: expected a positive number of seconds, found inf;"),
         ({"seeds": (0, -1)}, r"--seed: expected seeds from 0 to 2\^64 - 1, found -1;"),
         ({"seeds": (2**64,)}, "--seed: expected seeds from 0 to .*, found 18446744073709551616;"),
+        ({"seeds": (1.5,)}, r"--seed: expected seeds from 0 to 2\^64 - 1, found 1.5;"),
+        ({"seeds": 3}, r"seeds: expected seeds such as \[0\] or range\(3\), found 3;"),
+        ({"seeds": ()}, "seeds: expected at least one, found none;"),
+        ({"methods": []}, "methods: expected at least one, found none;"),
+        ({"scenes": []}, "scenes: expected at least one, found none;"),
         ({"max_width": 0}, "--max-width: expected 1 or more, found 0;"),
         ({"threads": -1}, "--threads: expected 1 or more, found -1;"),
         ({"jobs": 0}, "--jobs: expected 1 or more, found 0;"),
@@ -159,3 +166,17 @@ def test_bench_refuses_before_it_trains(in_folder, wrong, message):
     with pytest.raises(cs.ChronoSceneError, match=message):
         cs.bench(**right | wrong)
     assert not list(Path().glob("runs/plaza/*"))
+
+
+def test_rows_keep_names_of_digits_and_have_their_columns_without_runs(tmp_path):
+    """pandas would read the scene 007 as 7, and an empty variant as not a number."""
+    columns = [*RUN_COLUMNS, *ROW_COLUMNS]
+    line = dict.fromkeys(columns, "") | {"scene": "007", "view": "NA", "value": "inf"}
+    line |= dict.fromkeys(("seed", "camera_period", "rendered_period"), "2")
+    text = f"{','.join(columns)}\n{','.join(line.values())}\n"
+    (tmp_path / "rows.csv").write_text(text)
+    rows = cs.BenchmarkResult((tmp_path,), ()).rows()
+    assert rows.loc[0, ["scene", "view", "variant", "seed", "value"]].tolist() == [
+        *("007", "NA", "", 2, math.inf)
+    ]
+    assert [*cs.BenchmarkResult((), ()).rows()] == [*rows] == columns

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from itertools import chain
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +144,7 @@ class BenchSettings:
             if number is not None and number < 1:
                 raise _refused(option, "1 or more", number)
         for seed in self.seeds:
-            if not 0 <= seed < 2**64:
+            if not (isinstance(seed, Integral) and 0 <= seed < 2**64):
                 raise _refused("--seed", "seeds from 0 to 2^64 - 1", seed)
         budget = self.run.budget_seconds
         if budget is not None and not 0 < budget < math.inf:
