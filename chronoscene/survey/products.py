@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -184,6 +184,8 @@ def write_survey(
 
     Arguments, result and errors as for `survey_run`.
     """
+    points = scene.points
+    scene = replace(scene, points=points.select(np.isfinite(points.xyz).all(axis=1)))
     if run is None:
         summary = survey_scene(scene, folder, options)
     else:

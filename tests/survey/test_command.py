@@ -112,6 +112,20 @@ def test_a_scene_without_a_model_has_points_alone(tmp_path):
     assert "--device: expected no such option for a scene without a model" in str(again.exception)
 
 
+@pytest.mark.parametrize("kind", ["run", "scene"])
+def test_points_that_are_not_finite_are_left_out(site, tmp_path, kind):
+    run, toy = site
+    toy.found.points.xyz[:3] = [np.nan, np.inf, 0.0]
+    source = run
+    if kind == "scene":
+        source = scene_format.write(toy.found, tmp_path / "site", image_source="none")
+    result = survey(source, "--out", tmp_path / "out", *(["--resolution", "1"] * (kind == "run")))
+    assert result.exit_code == 0, result.output
+    if kind == "scene":
+        periods = json.loads((tmp_path / "out/survey.json").read_text())["periods"]
+        assert sum(p["points"] for p in periods) == len(toy.found.points) - 3
+
+
 def test_distances_between_dense_sparse_points(tmp_path):
     """The points of each period lie in a plane of their own, 0.5 m apart in a quarter of it."""
     made = make_scene(tmp_path)

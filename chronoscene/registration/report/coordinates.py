@@ -51,13 +51,14 @@ class Placed:
 
 
 def placed_scene(scene: Scene) -> Placed:
-    """Images and points of a scene."""
+    """Images and points of a scene; points that are not finite are nowhere."""
+    points = scene.points.select(np.isfinite(scene.points.xyz).all(axis=1))
     return Placed(
         names=[f.name for f in scene.frames],
         labels=[scene.periods[f.period].label for f in scene.frames],
         cam_from_world=scene.frame_poses,
-        points=scene.points.xyz,
-        colors=scene.points.rgb,
+        points=points.xyz,
+        colors=points.rgb,
     )
 
 
