@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.figures import canvas
-from chronoscene.statistics.counts import PeriodCount, SceneCount, period_title
+from chronoscene.statistics.counts import SceneCount, period_title
 
 BAR = 0.3  # Inches per scene
 WIDTH = 9.0
@@ -33,18 +33,23 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
     gap = 0.35
     width = (WIDTH - left - gap - 0.2) / 2
     seen = any(c.count == "seen" for c in counts)
-    kinds: tuple[tuple[str, Callable[[PeriodCount], int]], ...] = (
-        ("images", lambda p: p.images),
-        ("points, again in each period" if seen else "points", lambda p: p.points),
+    legend = _period_names(counts, periods)
+    points = [[p.points for p in c.periods] for c in counts]
+    if any(c.points_without_period for c in counts):
+        for row, c in zip(points, counts, strict=True):
+            row += [0] * (periods - len(row)) + [c.points_without_period]
+        legend, colors = [*legend, canvas.UNSEEN], [*colors, canvas.UNSEEN_COLOR]
+    kinds = (
+        ("images", [[p.images for p in c.periods] for c in counts]),
+        ("points, again in each period" if seen else "points", points),
     )
-    for i, (what, of) in enumerate(kinds):
+    for i, (what, values) in enumerate(kinds):
         box = (left + i * (width + gap), bottom, width, height - top - bottom)
         axes = figure.add_axes((box[0] / WIDTH, box[1] / height, box[2] / WIDTH, box[3] / height))
-        values = [[of(p) for p in c.periods] for c in counts]
         _draw_panel(axes, what, values, colors)
         axes.set_yticks(range(len(counts)), [] if i else map(canvas.plain, names))
         axes.tick_params(axis="y", length=0, labelsize=9)
-    _legend(figure, _period_names(counts, periods), colors, 1 - 0.1 / height)
+    _legend(figure, legend, colors, 1 - 0.1 / height)
     canvas.save(figure, path)
 
 
@@ -58,7 +63,7 @@ def _draw_panel(
     axes.grid(axis="x", color=canvas.GRID, linewidth=0.6)
     sums = [sum(row) for row in values]
     for p, color in enumerate(colors):
-        rows = [y for y, row in enumerate(values) if p < len(row)]
+        rows = [y for y, row in enumerate(values) if p < len(row) and row[p]]
         axes.barh(
             rows,
             [values[y][p] for y in rows],

@@ -25,6 +25,8 @@ WIDE_FONTS = (
 )
 """With letters that are not European, on the usual systems."""
 GREY = "#555555"
+UNSEEN, UNSEEN_COLOR = "seen by no image", "#808080"
+"""Name and colour of points without a period."""
 GRID = "#dddddd"
 
 

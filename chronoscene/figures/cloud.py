@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.arrays import Array
+from chronoscene.figures import canvas
 from chronoscene.io.wording import printable
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
@@ -58,6 +59,14 @@ class Cloud:
     camera_period: NDArray[np.int64]
     """[C]"""
 
+    def groups(self) -> tuple[NDArray[np.int64], list[str]]:
+        """Return the group of each point [P], and the colours of all groups: the periods and, if
+        there are any, the points that no image sees."""
+        colors, unseen = canvas.period_colors(len(self.labels)), self.period < 0
+        if not unseen.any():
+            return self.period, colors
+        return np.where(unseen, len(colors), self.period), [*colors, canvas.UNSEEN_COLOR]
+
 
 def cloud_of(scene: Scene) -> Cloud:
     """Collect the points and cameras of a scene."""
@@ -76,8 +85,13 @@ def cloud_of(scene: Scene) -> Cloud:
 
 
 def shown_box(cloud: Cloud, *, cameras: bool) -> Box:
-    """Find robust limits of the points (and of the cameras), wide enough for a readable panel."""
-    good = (cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1)
+    """Find robust limits of the points (and of the cameras), wide enough for a readable panel.
+
+    Points that no image sees count if there are no others, as of a laser scan.
+    """
+    finite = np.isfinite(cloud.xyz).all(axis=1)
+    seen = finite & (cloud.period >= 0)
+    good = seen if seen.any() else finite
     corners = robust_range(cloud.xyz[good]) if good.any() else np.zeros((0, 3))
     if cameras or not len(corners):
         known = cloud.centres[np.isfinite(cloud.centres).all(axis=1)]

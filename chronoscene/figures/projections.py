@@ -49,15 +49,17 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
         cameras: Whether to draw the cameras, too, with their viewing directions.
     """
     cloud, box, axis_names = readable(cloud, shown_box(cloud, cameras=cameras))
+    period, colors = cloud.groups()
+    cloud = replace(cloud, period=period)
     dx, dy, dz = box.edges
     scale = min((DRAWING[0] - GAP) / (dx + dz), (DRAWING[1] - GAP) / (dy + dz))
     width = max(LEFT + (dx + dz) * scale + GAP + RIGHT, MIN_WIDTH)
     names = legend_names(cloud.labels)
+    names += [canvas.UNSEEN] * (len(colors) - len(names))
     columns = max(1, int((width - LEFT) / (0.42 + 0.075 * max(map(len, names)))))
     top = TITLE + LINE * -(-len(names) // columns)
     height = BOTTOM + (dz + dy) * scale + GAP + top
     figure = canvas.new_figure(width, height)
-    colors = canvas.period_colors(len(names))
     x_right, y_top = LEFT + dx * scale + GAP, BOTTOM + dz * scale + GAP
     places = {(0, 1): (LEFT, y_top), (0, 2): (LEFT, BOTTOM), (2, 1): (x_right, y_top)}
     dots = _dot_radius(cloud, box, scale, places)
@@ -111,8 +113,7 @@ def legend_names(labels: Sequence[str]) -> list[str]:
 
 def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[Plane]) -> int:
     """Choose the radius of the dots in pixels by the occupied area of the median panel."""
-    shown = cloud.xyz[cloud.period >= 0]
-    shown = shown[box.holds(shown)]
+    shown = cloud.xyz[box.holds(cloud.xyz)]
     if not len(shown):
         return 0
     cells = np.floor((shown - box.low) * (scale * DPI / PATCH)).astype(np.int64)
@@ -189,9 +190,8 @@ def _write_texts(figure: Any, cloud: Cloud, box: Box, corner: tuple[float, float
     longest = int((width - LEFT) / 0.095)
     name = shorten(cloud.name, longest, placeholder="...") or cloud.name[:longest]
     figure.text(left, top, canvas.plain(name), fontsize=11, va="top")
-    counted = cloud.period >= 0
-    outside = int((counted & ~box.holds(cloud.xyz)).sum())
-    lines = [f"{int(counted.sum()):,} points", f"{len(cloud.centres):,} cameras"]
+    outside = int((~box.holds(cloud.xyz)).sum())
+    lines = [f"{len(cloud.xyz):,} points", f"{len(cloud.centres):,} cameras"]
     if outside:
         lines.insert(1, f"{outside:,} outside")
     at = corner[0], corner[1] - 0.42 / height

@@ -39,16 +39,17 @@ def page_of(cloud: Cloud, rgb: NDArray[np.uint8]) -> str:
 
 def _page_data(cloud: Cloud, rgb: NDArray[np.uint8]) -> dict[str, Any]:
     """Collect the data of the script. Coordinates are relative to the middle of the scene."""
-    good = np.flatnonzero((cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1))
+    group, colors = cloud.groups()
+    labels = [*cloud.labels, canvas.UNSEEN][: len(colors)]
+    good = np.flatnonzero(np.isfinite(cloud.xyz).all(axis=1))
     shown = np.random.default_rng(0).permutation(good)[:MAX_POINTS]
     # By period, in random order within: any first part of a period stands for all of it.
-    shown = shown[np.argsort(cloud.period[shown], kind="stable")]
+    shown = shown[np.argsort(group[shown], kind="stable")]
     box = shown_box(cloud, cameras=False)
     middle = (box.low + box.high) / 2
-    colors = canvas.period_colors(len(cloud.labels))
-    groups = cloud.period[good], cloud.period[shown], cloud.camera_period
-    numbers = np.transpose([np.bincount(group, minlength=len(colors)) for group in groups])
-    periods = zip(cloud.labels, colors, numbers.tolist(), strict=True)
+    members = group[good], group[shown], cloud.camera_period
+    numbers = np.transpose([np.bincount(each, minlength=len(colors)) for each in members])
+    periods = zip(labels, colors, numbers.tolist(), strict=True)
     return {
         "name": cloud.name,
         "unit": "m" if cloud.unit == "metre" else "",

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from chronoscene.figures import projections
+from chronoscene.figures import canvas, projections
 from chronoscene.figures.bars import _period_names, draw_bars
 from chronoscene.figures.canvas import EIGHT, FOUR, period_colors, rgb_of
 from chronoscene.figures.cloud import Cloud, shown_box
@@ -219,6 +219,24 @@ def test_the_colours_of_all_periods_are_in_the_picture(cloud, tmp_path):
         assert (pixels == rgb_of(color)).all(axis=1).sum() > 200  # the legend alone is smaller
 
 
+@pytest.mark.parametrize("unseen", [900, 3000])
+def test_points_that_no_image_sees_are_grey(cloud, tmp_path, monkeypatch, unseen):
+    """As those of a laser scan, from which methods start."""
+    period = cloud.period.copy()
+    period[:unseen] = -1
+    kept, save = [], canvas.save
+    monkeypatch.setattr(canvas, "save", lambda *a: (kept.append(a[0]), save(*a)))
+    draw_cloud(replace(cloud, period=period), tmp_path / "a.png")
+    assert kept[0].legends[0].get_texts()[-1].get_text() == "seen by no image"
+    assert "3,000 points" in kept[0].texts[-1].get_text()
+    pixels = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).reshape(-1, 3)
+    assert (pixels == rgb_of("#808080")).all(axis=1).sum() > 200
+    box, whole = (
+        shown_box(replace(cloud, period=p), cameras=False) for p in (period, cloud.period)
+    )
+    np.testing.assert_allclose(box.edges, whole.edges, rtol=0.1)
+
+
 @pytest.mark.parametrize(
     ("scale", "place", "unit", "names"),
     [
@@ -315,6 +333,18 @@ def test_bars_are_as_long_as_the_counts(tmp_path, monkeypatch):
         (round(b.get_y() + b.get_height() / 2), b.get_x(), b.get_width()) for b in points.patches
     )
     assert bars == [(0, 0, 50), (0, 50, 10), (1, 0, 20)]
+
+
+def test_bars_have_the_points_that_no_image_sees(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr("chronoscene.figures.canvas.save", lambda figure, path: kept.append(figure))
+    scan = replace(counted("scan", [(2, 0)]), points=40, points_without_period=40)
+    draw_bars([counted("a", [(3, 50), (2, 10)]), scan], tmp_path / "x.png")
+    bars = [(round(b.get_y() + 0.36), b.get_x(), b.get_width()) for b in kept[0].axes[1].patches]
+    assert sorted(bars) == [(0, 0, 50), (0, 50, 10), (1, 0, 40)]
+    assert kept[0].axes[1].get_xlabel() == "points, 100 in all"
+    names = [text.get_text() for text in kept[0].legends[0].get_texts()]
+    assert names == ["Period 0", "Period 1", "seen by no image"]
 
 
 def test_the_legend_of_the_bars_has_names_that_all_scenes_share():

@@ -55,14 +55,14 @@ def floats(text: str) -> np.ndarray:
 
 def test_all_points_are_there_by_period(cloud):
     data = data_of(page_of(cloud, colors(cloud)))
-    assert [p["points"] for p in data["periods"]] == [500, 300, 0]
-    assert [p["shown"] for p in data["periods"]] == [500, 300, 0]
-    assert [p["cameras"] for p in data["periods"]] == [2, 2, 2]
-    assert (data["points"], data["left_out"]) == (800, 100)
+    assert [p["points"] for p in data["periods"]] == [500, 300, 0, 100]
+    assert [p["shown"] for p in data["periods"]] == [500, 300, 0, 100]
+    assert [p["cameras"] for p in data["periods"]] == [2, 2, 2, 0]
+    assert (data["points"], data["left_out"]) == (900, 0)
     xyz, rgb = floats(data["xyz"]), base64.b64decode(data["rgb"])
-    assert len(rgb) == 3 * len(xyz) == 2400
-    offset = cloud.xyz[:800].mean(axis=0) - xyz.mean(axis=0)
-    for span in (slice(0, 500), slice(500, 800)):
+    assert len(rgb) == 3 * len(xyz) == 2700
+    offset = cloud.xyz.mean(axis=0) - xyz.mean(axis=0)
+    for span in (slice(0, 500), slice(500, 800), slice(800, 900)):
         order, wanted = (np.lexsort(a.T) for a in (xyz[span], cloud.xyz[span]))
         np.testing.assert_allclose(xyz[span][order] + offset, cloud.xyz[span][wanted], atol=1e-5)
         pixels = np.frombuffer(rgb, np.uint8).reshape(-1, 3)[span]
@@ -74,8 +74,8 @@ def test_many_points_are_thinned_evenly_and_equally(cloud, monkeypatch):
     page = page_of(cloud, colors(cloud))
     data = data_of(page)
     shown = [p["shown"] for p in data["periods"]]
-    assert sum(shown) == 200 and shown[0] == pytest.approx(125, abs=25)
-    assert [p["points"] for p in data["periods"]] == [500, 300, 0]
+    assert sum(shown) == 200 and shown[0] == pytest.approx(111, abs=25)
+    assert [p["points"] for p in data["periods"]] == [500, 300, 0, 100]
     assert page == page_of(cloud, colors(cloud))
 
 
@@ -208,7 +208,9 @@ def browse(page: Path, folder: Path) -> str:
 
 def test_in_a_browser(cloud, tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "MAX_POINTS", 700)
-    nasty = replace(cloud, labels=("0", NASTY, "2"))
+    xyz = cloud.xyz.copy()
+    xyz[:9] = np.nan
+    nasty = replace(cloud, labels=("0", NASTY, "2"), xyz=xyz)
     page = page_of(nasty, colors(cloud))
     (tmp_path / "page.html").write_text(page.replace("</body>", SCRIPT + "</body>"), "utf-8")
     found = re.search('data-report="(.*?)"', browse(tmp_path / "page.html", tmp_path))
@@ -233,7 +235,7 @@ def test_in_a_browser(cloud, tmp_path, monkeypatch):
     assert np.abs(np.array(report["turned"]) - report["dragged"]).max() > 0.1
     assert report["pinched"] == pytest.approx(2)
     assert report["cameras"] and report["dark"]
-    assert report["labels"] == ["Period 0", f"1: {NASTY}", "Period 2"]
+    assert report["labels"] == ["Period 0", f"1: {NASTY}", "Period 2", "seen by no image"]
     assert report["text"] == (
-        "700 of 800 points, chosen at random, 6 cameras; 100 that no image sees are left out"
+        "700 of 891 points, chosen at random, 6 cameras; 9 that are not finite are left out"
     )

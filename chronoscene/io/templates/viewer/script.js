@@ -218,7 +218,8 @@ const boxes = data.periods.map((period, p) => {
   const count = document.createElement("small");
   box.type = "checkbox"; box.checked = true;
   swatch.style.background = period.color;
-  name.textContent = period.label === String(p) ? `Period ${p}` : `${p}: ${period.label}`;
+  name.textContent = !period.cameras ? period.label  // points that no image sees
+    : period.label === String(p) ? `Period ${p}` : `${p}: ${period.label}`;
   name.title = `${name.textContent} (${number.format(period.cameras)} cameras)`;
   count.textContent = number.format(period.points);
   label.append(box, swatch, name, count);
@@ -266,7 +267,7 @@ get("counts").textContent = (shown < data.points
   ? `${number.format(shown)} of ${number.format(data.points)} points, chosen at random`
   : `${number.format(shown)} points`)
   + `, ${number.format(data.camera_period.length)} cameras`
-  + (data.left_out ? `; ${number.format(data.left_out)} that no image sees are left out` : "");
+  + (data.left_out ? `; ${number.format(data.left_out)} that are not finite are left out` : "");
 // Few points are easier to see as large dots, many do not clot as small ones.
 get("size").value = [[150000, 1], [3000, 2], [300, 3], [30, 5]].find(([n]) => shown > n)?.[1] || 6;
 canvas.setAttribute("aria-label", `Points of ${data.name}, coloured by period`);
