@@ -70,12 +70,11 @@ def command(
             progress=partial(bar, "images"),
             written=() if system is None else coordinate_files(),
         )
-    scene = done.scene
+    # OUT may have other names of images and another split than SRC.
+    scene = read_scene(out, format=target)
     if system is not None:
-        frame = _local_frame(scene.world, out)
-        # The images of OUT may have other names.
-        write_coordinates(out, placed_scene(read_scene(out, format=target)), frame, system)
-    lines = [f"{out}: {target} from {scene.format}, {describe(scene)}"]
+        write_coordinates(out, placed_scene(scene), _local_frame(scene.world, out), system)
+    lines = [f"{out}: {target} from {done.scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")
     emit("\n".join(lines) + "\n")

@@ -4,6 +4,7 @@ import csv
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,11 @@ from click.testing import CliRunner
 
 from chronoscene.cli import cli, main
 from chronoscene.errors import ConfigError
+from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
 from chronoscene.geodesy import Georeference, read_reference_system
+from chronoscene.io.documents import read_json_document
+from chronoscene.scene import WorldFrame
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.splits import split_hash
 
@@ -39,6 +43,13 @@ def test_says_what_was_converted(make_scene_folder, tmp_path):
         "note: nerfstudio cannot store the observations of points, their ids and errors\n"
     )
     assert read_scene(tmp_path / "out").format == "nerfstudio"
+
+
+def test_the_split_is_that_of_the_scene_that_was_written(make_scene_folder, tmp_path):
+    result = run(make_scene_folder(), tmp_path / "out", "--to", "cl-splats")
+    scene = read_scene(tmp_path / "out")
+    assert "split: every 8th image of all in name order" in result.stdout
+    assert split_hash(scene) in result.stdout and "  period 1: 2 train, 0 test" in result.stdout
 
 
 @pytest.mark.parametrize(("kind", "is_link"), [("hard", False), ("sym", True)])
@@ -81,6 +92,17 @@ def test_coordinates_in_a_reference_system(make_scene_folder, tmp_path):
     assert "not part of the format, and not converted: certificate.json\n" in again.stderr
     without = run(tmp_path / "out", tmp_path / "without")
     assert "not converted: cameras.csv, certificate.json, georeference.json" in without.stderr
+
+
+def test_points_that_are_not_finite_have_no_coordinates(make_scene_folder, tmp_path):
+    scene = read_scene(make_scene_folder())
+    scene.points.xyz[0] = np.nan
+    world = WorldFrame("metre", Georeference(51.0, 11.0, 200.0, "as stated").crs)
+    our_format.write(replace(scene, world=world), tmp_path / "nan", image_source="copy")
+    assert run(tmp_path / "nan", tmp_path / "out", "--crs", "EPSG:32632").exit_code == 0
+    record = read_json_document(tmp_path / "out/georeference.json")
+    assert 0 <= record["output"]["largest_error"] < 1
+    assert b"element vertex 29\n" in (tmp_path / "out/points.ply").read_bytes()
 
 
 def test_coordinates_are_of_the_images_that_were_written(make_scene_folder, tmp_path):
