@@ -186,7 +186,7 @@ def _kept_images(scene: Scene, edits: Edits) -> NDArray[np.bool_]:
         ("--drop-period", edits.drop_periods),
     ):
         if texts:
-            chosen = list(_chosen_periods(scene, texts, option))
+            chosen = list(chosen_periods(scene, texts, option))
             found = np.isin(scene.frame_periods, chosen)
             kept &= found if option == "--keep-period" else ~found
     return kept
@@ -226,7 +226,7 @@ def _find_periods(scene: Scene, text: str) -> set[int]:
     return by_label or {p.id for p in scene.periods if str(p.id) == text}
 
 
-def _chosen_periods(scene: Scene, texts: Iterable[str], option: str) -> set[int]:
+def chosen_periods(scene: Scene, texts: Iterable[str], option: str) -> set[int]:
     """Find all periods that an option names.
 
     Raises:

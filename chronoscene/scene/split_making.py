@@ -245,7 +245,7 @@ def whole_periods(scene: Scene, settings: SplitSettings, times: Times) -> set[st
             "--period",
             expected=f"ids of periods to hold out, 0..{len(known) - 1}",
             found=", ".join(map(str, periods)) or "none",
-            todo="give --period ID once for each of them",
+            todo="give --period once for each of them",
         )
     return {f.name for f in scene.frames if f.period in periods}
 

@@ -14,6 +14,7 @@ from chronoscene.cli.output import A_FILE, check_place, emit, say, writing_to
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import describe_period, read_and_note, show_note
 from chronoscene.convert import remarks_on
+from chronoscene.edit import chosen_periods
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.exif import capture_times
@@ -55,9 +56,9 @@ from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, Split
 @click.option(
     "--period",
     "periods",
-    type=int,
+    metavar="PERIOD",
     multiple=True,
-    help="For periods: id of a period to hold out. May be repeated.",
+    help="For periods: label or id of a period to hold out. May be repeated.",
 )
 @click.option(
     "--scene-out",
@@ -71,6 +72,7 @@ def command(
     out: Path | None,
     fraction: float | None,
     every: int | None,
+    periods: tuple[str, ...],
     scene_out: Path | None,
     dataset_format: str | None,
     period_by: str | None,
@@ -87,7 +89,8 @@ def command(
     _check_targets(source, out, scene_out)
     say(f"read {source}")
     scene = read_and_note(source, dataset_format, period_by)
-    settings = SplitSettings(fraction=_fraction(fraction, every), **options)
+    chosen = tuple(sorted(chosen_periods(scene, periods, "--period")))
+    settings = SplitSettings(fraction=_fraction(fraction, every), periods=chosen, **options)
     names = [f.name for f in scene.frames] if settings.strategy == "date" else []
     split = make_split(scene, settings, capture_times(scene.images_root, names))
     for frame in split.scene.frames:

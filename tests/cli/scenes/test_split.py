@@ -68,8 +68,12 @@ def test_scene_out(scene, tmp_path):
     assert (tmp_path / "new/images/a/00.png").samefile(scene / "images/a/00.png")
 
 
-def test_whole_periods_are_remarked_upon(scene, tmp_path):
-    result = run(scene, tmp_path / "t.txt", "--strategy", "periods", "--period", 1)
+@pytest.mark.parametrize("period", [1, "after the works"])
+def test_whole_periods_are_remarked_upon(scene, tmp_path, period):
+    labels = [{"id": 0}, {"id": 1, "label": "after the works"}]
+    (scene / "sparse/periods.json").write_text(json.dumps(labels))
+    result = run(scene, tmp_path / "t.txt", "--strategy", "periods", "--period", period)
+    assert json.loads((tmp_path / "t.json").read_text())["periods"] == [1]
     assert "note: period 0 has no test images\n" in result.stdout
     assert "note: period 1 has no train images\n" in result.stdout
 
