@@ -14,6 +14,7 @@ from chronoscene.cli.scenes.reading import LINKS, describe, read_and_note, show_
 from chronoscene.convert import remarks_on
 from chronoscene.images.undistortion import CameraChange
 from chronoscene.io.staging import check_outside
+from chronoscene.io.wording import counted
 from chronoscene.scene.splits import split_hash
 from chronoscene.undistort import Undistortion, undistort
 
@@ -75,8 +76,8 @@ def report(done: Undistortion) -> str:
         lines.append(f"  ... and {len(done.changes) - 20} more cameras")
     if done.observations_lost:
         lines.append(
-            f"{done.observations_lost} observations outside of the new images, and "
-            f"{done.points_lost} points without any other, were dropped"
+            f"dropped: {counted(done.observations_lost, 'observation')} outside of the new images, "
+            f"and {counted(done.points_lost, 'point')} without any other"
         )
     lines.append(f"split hash {split_hash(done.scene)}")
     return "\n".join(lines) + "\n"

@@ -46,7 +46,7 @@ def test_says_what_was_dropped(make_scene_folder, tmp_path):
     (folder / "sparse/0/cameras.txt").write_text("1 PINHOLE 64 48 50 52 10 10\n")
     result = run(folder, tmp_path / "out", "--center")
     assert "PINHOLE 20 x 20" in result.stdout
-    assert "observations outside of the new images, and " in result.stdout
+    assert " outside of the new images, and " in result.stdout
 
 
 def test_names_what_is_left_out(make_scene_folder, tmp_path):
