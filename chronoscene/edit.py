@@ -253,7 +253,7 @@ def _inside(points: Points, box: Box) -> NDArray[np.bool_]:
     low, high = np.array(box[:3]), np.array(box[3:])
     inside = np.asarray(((points.xyz >= low) & (points.xyz <= high)).all(axis=1))
     if not inside.any():
-        finite = points.xyz[np.isfinite(points.xyz).all(axis=1)]
+        finite = points.xyz[points.finite]
         found = "none"
         if len(finite):
             found += " of those between " + " and ".join(

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chronoscene.colmap.model import PosedImage
 from chronoscene.errors import ConfigError, SceneError
@@ -301,7 +300,7 @@ def write(
     """
     for frame in scene.frames:
         check_name(out, frame.name)
-    finite = _finite(scene.points)
+    finite = scene.points.finite
     if not finite.all():
         scene = replace(scene, points=scene.points.select(finite))
     text = json.dumps(_to_json(scene), indent=1, ensure_ascii=False) + "\n"
@@ -318,18 +317,13 @@ def losses(scene: Scene) -> list[str]:
     lost = []
     if len(scene.points.track_frame):
         lost.append("the observations of points, their ids and errors")
-    if count := int((~_finite(scene.points)).sum()):
+    if count := int((~scene.points.finite).sum()):
         lost.append(f"{count} points that are not finite")
     if len({frame.camera.model == FISHEYE for frame in scene.frames}) > 1:
         lost.append(f"{FISHEYE} beside other cameras, as its loader uses one kind for all frames")
     if 0 < len(scene.masks) < len(scene.frames):
         lost.append("masks of some frames only, as its loader wants one for each or for none")
     return lost
-
-
-def _finite(points: Points) -> NDArray[np.bool_]:
-    """Return True for the points that a cloud can hold. [P]"""
-    return np.asarray(np.isfinite(points.xyz).all(axis=1))
 
 
 def _to_json(scene: Scene) -> dict[str, Any]:

@@ -52,6 +52,11 @@ class PointTable:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def finite(self) -> NDArray[np.bool_]:
+        """True for points with finite coordinates. [P]"""
+        return np.asarray(np.isfinite(self.xyz).all(axis=1))
+
     def select(self, keep: NDArray[np.bool_]) -> Self:
         """Keep some of the points [P], each with all of its observations."""
         track_start, observed = select_tracks(self.track_start, keep)

@@ -184,8 +184,7 @@ def write_survey(
 
     Arguments, result and errors as for `survey_run`.
     """
-    points = scene.points
-    scene = replace(scene, points=points.select(np.isfinite(points.xyz).all(axis=1)))
+    scene = replace(scene, points=scene.points.select(scene.points.finite))
     if run is None:
         summary = survey_scene(scene, folder, options)
     else:

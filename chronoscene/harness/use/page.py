@@ -183,7 +183,7 @@ def _document(
     """Collect what the page knows beside the Gaussians, in its frame and axes."""
     store = runs[0].photos(scene)
     poses = page_from_world.apply_to_pose(np.stack([frame.cam_from_world for frame in frames]))
-    points = scene.points.xyz[np.isfinite(scene.points.xyz).all(axis=1)]
+    points = scene.points.xyz[scene.points.finite]
     middle = page_from_world.apply(points) if len(points) else cloud.means.astype(np.float64)
     start = orbit(poses, middle, 1)[0]
     distance = STEP_BACK * np.linalg.norm(camera_centre(start) - np.median(middle, axis=0))

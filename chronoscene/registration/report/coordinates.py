@@ -52,7 +52,7 @@ class Placed:
 
 def placed_scene(scene: Scene) -> Placed:
     """Images and points of a scene; points that are not finite are nowhere."""
-    points = scene.points.select(np.isfinite(scene.points.xyz).all(axis=1))
+    points = scene.points.select(scene.points.finite)
     return Placed(
         names=[f.name for f in scene.frames],
         labels=[scene.periods[f.period].label for f in scene.frames],

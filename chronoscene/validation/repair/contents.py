@@ -46,7 +46,7 @@ def repair_model(images: RawImages, points: RawPoints) -> tuple[RawImages, RawPo
     before = points
     images = _unit_quaternions(images, repairs)
     points = _without_broken_observations(images, points, repairs)
-    keep = np.asarray(np.isfinite(points.xyz).all(axis=1))
+    keep = points.finite
     if gone := int(np.count_nonzero(~keep)):
         _note(repairs, "CS502", gone, "point", "without finite coordinates removed")
         points = points.select(keep)

@@ -37,8 +37,7 @@ def no_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
 )
 def point_not_finite(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
     """The coordinates of a point are NaN or infinite."""
-    bad = np.asarray(~np.isfinite(points.xyz).all(axis=1))
-    yield from _some_points(scene, points, bad, "finite coordinates", "NaN or infinity")
+    yield from _some_points(scene, points, ~points.finite, "finite coordinates", "NaN or infinity")
 
 
 @rule.warning(
