@@ -30,7 +30,7 @@ from torch import Tensor
 from chronoscene.anchors.density import AnchorCounters
 from chronoscene.errors import CheckpointError
 from chronoscene.kernels.compilation import kernel
-from chronoscene.training.devices import to_device
+from chronoscene.training.devices import has_kernels, to_device
 
 _LEAST_LOSS = 1e-4  # Photos that are black, and shown so, say nothing
 _FORGET = 0.9  # What counts of earlier views after a round
@@ -120,14 +120,30 @@ def decay_to_mean(blocks: Tensor, block_rows: Tensor, share: float) -> None:
         block_rows: Block of an anchor at a period. int64 [A, T]
         share: Part of the way, 0..1.
     """
-    mean = blocks[block_rows[:, 0]]
-    for rows in block_rows.T[1:]:
-        mean += blocks[rows]
-    mean /= block_rows.shape[1]
+    if has_kernels(blocks):
+        _decay(blocks.detach().numpy(), block_rows.numpy(), np.float32(share))
+        return
+    mean = blocks[block_rows].mean(1)
     target = torch.empty_like(blocks)
-    for rows in block_rows.T:
-        target[rows] = mean
+    target[block_rows] = mean[:, None]  # to the periods that share a block the same
     blocks.lerp_(target, share)
+
+
+@kernel(parallel=True)
+def _decay(blocks, rows, share):  # type: ignore[no-untyped-def]
+    anchors, periods = rows.shape
+    count, length = blocks.shape
+    means = np.zeros((anchors, length), np.float32)
+    owner = np.zeros(count, np.int64)
+    for a in prange(anchors):
+        for t in range(periods):
+            owner[rows[a, t]] = a
+            for f in range(length):
+                means[a, f] += blocks[rows[a, t], f]
+    for b in prange(count):
+        for f in range(length):
+            mean = means[owner[b], f] / np.float32(periods)
+            blocks[b, f] += share * (mean - blocks[b, f])
 
 
 class BlockStatistics(AnchorCounters):

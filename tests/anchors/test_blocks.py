@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor
 
+from chronoscene.anchors import blocks as blocks_module
 from chronoscene.anchors.blocks import (
     BlockStatistics,
     agglomerate,
@@ -63,15 +64,19 @@ def test_what_periods_share_is_counted(anchors: int, periods: int, seed: int) ->
 
 
 @settings(max_examples=50)
-@given(st.integers(1, 6), st.integers(2, 7), st.integers(0, 1000), st.floats(0.0, 1.0))
+@given(
+    st.integers(1, 6), st.integers(2, 7), st.integers(0, 1000), st.floats(0.0, 1.0), st.booleans()
+)
 def test_blocks_decay_to_the_mean_of_their_anchor(
-    anchors: int, periods: int, seed: int, share: float
+    anchors: int, periods: int, seed: int, share: float, kernels: bool
 ) -> None:
     count, rows = shared_rows(anchors, periods, seed)
     blocks = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
     before = blocks[rows].double().numpy()
     mean = before.mean(axis=1, keepdims=True)
-    decay_to_mean(blocks, rows, share)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(blocks_module, "has_kernels", lambda *_: kernels)
+        decay_to_mean(blocks, rows, share)
     expected = mean + (1 - share) * (before - mean)
     np.testing.assert_allclose(blocks[rows].numpy(), expected, atol=1e-6)
 
