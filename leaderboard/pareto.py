@@ -25,7 +25,12 @@ class Point(NamedTuple):
 
 
 def plot(
-    points: Sequence[Point], legend: Mapping[int, tuple[str, str]], *, cost: str, metric: str
+    points: Sequence[Point],
+    legend: Mapping[int, tuple[str, str]],
+    *,
+    cost: str,
+    metric: str,
+    tolerance: float = 0.0,
 ) -> Markup | None:
     """Draw methods and the front of those to which none is superior.
 
@@ -34,6 +39,7 @@ def plot(
         legend: Name and colour of each number.
         cost: Name of the horizontal axis.
         metric: Metric of the vertical axis.
+        tolerance: Share by which costs may differ and still be equal.
 
     Returns:
         None where all cost much the same, as under a budget of time.
@@ -43,7 +49,8 @@ def plot(
         return None
     info = metric_info(metric)
     costs, quality = np.array([[p.cost, p.quality] for p in points]).T
-    best = on_front(costs, quality if info.higher_is_better else -quality).tolist()
+    signed = quality if info.higher_is_better else -quality
+    best = on_front(costs, signed, tolerance).tolist()
     marks = [
         Mark(number=p.number, x=p.cost, y=p.quality, on_front=is_best)
         for p, is_best in zip(points, best, strict=True)

@@ -18,6 +18,7 @@ from chronoscene.harness.report.summary import (
     short_commits,
 )
 from chronoscene.harness.report.tables import period_title
+from chronoscene.harness.report.tradeoff import SAME_TIME
 from chronoscene.metrics.registry import metric_info
 from leaderboard.pareto import Point, plot
 from leaderboard.scenes import meaning_of, role_of
@@ -106,7 +107,8 @@ def _plots(
             spent, gained = (label, name, column), (label, quality, "macro")
             if {spent, gained} <= {*values.index}:
                 points.append(Point(i, float(in_unit(name, values[spent])), values[gained]))
-        plots.append(plot(points, legend, cost=cost, metric=quality))
+        same = SAME_TIME if name == "seconds" else 0.0
+        plots.append(plot(points, legend, cost=cost, metric=quality, tolerance=same))
     return [p for p in plots if p is not None]
 
 

@@ -24,6 +24,9 @@ def test_the_front_has_the_best_for_their_cost():
     assert "time [s]</text>" in svg and "PSNR [dB]</text>" in svg
     assert filled(plot(POINTS, LEGEND, cost="time [s]", metric="lpips_vgg")) == [1, 3]
     assert filled(plot([Point(2, 2, 5), Point(1, 1, 5)], LEGEND, cost="s", metric="psnr")) == [1]
+    same = [Point(1, 100, 5), Point(2, 100.5, 6), Point(3, 300, 7)]
+    assert filled(plot(same, LEGEND, cost="s", metric="psnr")) == [1, 2, 3]
+    assert filled(plot(same, LEGEND, cost="s", metric="psnr", tolerance=0.01)) == [2, 3]
 
 
 @pytest.mark.parametrize("costs", [[], [10], [90.0, 90.1, 90.2], [0, 10]])
