@@ -30,7 +30,8 @@ class ChronoGSConfig(AnchorConfig):
     period_decay: NonNegativeFloat = 0.0
     """Decay of an anchor's features of the periods towards their mean, in multiples of their
     learning rate per view: they differ only where the photos do, and elsewhere learn from the
-    photos of all periods. 0: none (paper and code)."""
+    photos of all periods. Periods without training views take no part. 0: none (paper and
+    code)."""
     fusion: Literal["concat", "sum"] = "concat"
     """``concat``: base, period and global feature side by side (code); ``sum``: added (formula of
     the paper; needs equal lengths)."""

@@ -117,14 +117,14 @@ def decay_to_mean(blocks: Tensor, block_rows: Tensor, share: float) -> None:
 
     Args:
         blocks: [B, Fv]
-        block_rows: Block of an anchor at a period. int64 [A, T]
+        block_rows: Block of an anchor at each period that takes part. int64 [A, T]
         share: Part of the way, 0..1.
     """
     if has_kernels(blocks):
         _decay(blocks.detach().numpy(), block_rows.numpy(), np.float32(share))
         return
     mean = blocks[block_rows].mean(1)
-    target = torch.empty_like(blocks)
+    target = blocks.clone()
     target[block_rows] = mean[:, None]  # to the periods that share a block the same
     blocks.lerp_(target, share)
 
@@ -134,13 +134,15 @@ def _decay(blocks, rows, share):  # type: ignore[no-untyped-def]
     anchors, periods = rows.shape
     count, length = blocks.shape
     means = np.zeros((anchors, length), np.float32)
-    owner = np.zeros(count, np.int64)
+    owner = np.full(count, -1)
     for a in prange(anchors):
         for t in range(periods):
             owner[rows[a, t]] = a
             for f in range(length):
                 means[a, f] += blocks[rows[a, t], f]
     for b in prange(count):
+        if owner[b] < 0:
+            continue
         for f in range(length):
             mean = means[owner[b], f] / np.float32(periods)
             blocks[b, f] += share * (mean - blocks[b, f])

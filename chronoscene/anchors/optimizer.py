@@ -181,10 +181,10 @@ class AnchorOptimizer:
             model.used_offsets = model.used_offsets[mask]
 
     @torch.no_grad()
-    def decay_blocks(self, share: float) -> None:
-        """Move the blocks of each anchor towards their mean by a share of the way."""
+    def decay_blocks(self, periods: Tensor, share: float) -> None:
+        """Move the blocks of each anchor at some periods towards their mean, by a share."""
         self.tables["blocks"].flush()
-        decay_to_mean(self.model.blocks, self.model.block_rows, share)
+        decay_to_mean(self.model.blocks, self.model.block_rows[:, periods], share)
 
     def keep_blocks(self, block_rows: Tensor) -> None:
         """Give the anchors these blocks, and forget those that no anchor has. int64 [A, T]"""

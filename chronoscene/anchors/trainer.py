@@ -109,6 +109,8 @@ class AnchorTrainer:
             merge_share=self.merge_share,
             generator=np.random.default_rng((seed, 1)),
         )
+        # Others, as of an earlier stage of a sequential training, are not to change.
+        self._periods = torch.from_numpy(np.unique(self.feature_rows)).to(model.device)
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed, train.expect)
@@ -157,11 +159,13 @@ class AnchorTrainer:
 
     def _decay(self, done: float) -> None:
         """Let the periods of each anchor become more alike, where that is asked for."""
-        if not self.period_decay or self.model.block_rows.shape[1] < 2:
+        if not self.period_decay or not self.model.layout.period_dim or len(self._periods) < 2:
             return
         rates = {"blocks": self.rates["blocks"]}
         rate = learning_rates(rates, done, cooldown=self.config.cooldown)["blocks"]
-        self.optimizer.decay_blocks(min(self.period_decay * rate * _DECAY_INTERVAL, 1.0))
+        self.optimizer.decay_blocks(
+            self._periods, min(self.period_decay * rate * _DECAY_INTERVAL, 1.0)
+        )
 
     def _progress_after(self, index: int, count: int, progress: float) -> float:
         """Return the share of the training that is over once this step is done."""

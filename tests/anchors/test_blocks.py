@@ -70,15 +70,18 @@ def test_what_periods_share_is_counted(anchors: int, periods: int, seed: int) ->
 def test_blocks_decay_to_the_mean_of_their_anchor(
     anchors: int, periods: int, seed: int, share: float, kernels: bool
 ) -> None:
-    count, rows = shared_rows(anchors, periods, seed)
+    count, every = shared_rows(anchors, periods, seed)
+    rows = every[:, : 1 + seed % periods]  # the other periods take no part
     blocks = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
-    before = blocks[rows].double().numpy()
+    before, others = blocks[rows].double().numpy(), np.setdiff1d(every, rows)
+    kept = blocks[others].clone()
     mean = before.mean(axis=1, keepdims=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(blocks_module, "has_kernels", lambda *_: kernels)
         decay_to_mean(blocks, rows, share)
     expected = mean + (1 - share) * (before - mean)
     np.testing.assert_allclose(blocks[rows].numpy(), expected, atol=1e-6)
+    assert torch.equal(blocks[others], kept)
 
 
 @pytest.mark.parametrize("periods", [256, 257, 1000])

@@ -163,6 +163,22 @@ def test_blocks_count_the_pixels_of_a_mask(monkeypatch: pytest.MonkeyPatch) -> N
         assert counted == 4 * [600 if mask is half else 1200]
 
 
+def test_periods_without_views_keep_their_features() -> None:
+    """Those of earlier stages of a sequential training are not to follow the new ones."""
+    every, spread = training_set(300, 40, 30), []
+    for views in (every.views, tuple(view for view in every.views if view.period == 0)):
+        method = make(replace(every, views=views), "chronogs", "fast", {"period_decay": 30.0})
+        generator = torch.Generator().manual_seed(0)
+        blocks = method.trainer.model.blocks  # type: ignore[attr-defined]
+        with torch.no_grad():
+            blocks.copy_(torch.randn(blocks.shape, generator=generator))
+        for index in range(20):
+            method.step(index, 0.01)
+        model = method.trainer.snapshot()  # type: ignore[attr-defined]
+        spread.append(float(model.blocks[model.block_rows].std(1).mean()))
+    assert spread[0] < 1e-4 and spread[1] > 0.8
+
+
 def test_anchors_move_before_a_round() -> None:
     """With one view to a step its gradients of anchors are dropped; of several they are not."""
     for views in (1, 4):
