@@ -23,6 +23,7 @@ from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.documents import read_json_document, read_text
 from chronoscene.io.staging import leads_out, staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame, splits
+from chronoscene.scene.geometry import is_rotation
 
 NAME = "chronoscene"
 MARKS = SPLIT = splits.SPLIT
@@ -102,7 +103,7 @@ def check_image(place: Path, image: PosedImage) -> None:
     wrong = None
     if not (np.abs(pose) < MAX_COORDINATE).all():
         wrong = f"a finite pose of {image.name!r}", "NaN, infinity, or absurdly large numbers"
-    elif np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > NOT_RIGID:
+    elif not is_rotation(pose[:3, :3], NOT_RIGID):
         found = "a different matrix, from a quaternion that is too large or too small"
         wrong = f"a rotation in the pose of {image.name!r}", found
     if wrong is not None:

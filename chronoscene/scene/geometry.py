@@ -59,6 +59,11 @@ def pose_from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) 
     return pose
 
 
+def is_rotation(matrix: Array, tolerance: float) -> bool:
+    """Return True if R R^T is the identity within a tolerance; False for NaN. [3, 3]"""
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= tolerance)
+
+
 def camera_centre(cam_from_world: Array) -> Array:
     """Compute camera centres in the world of poses. [..., 4, 4] -> [..., 3]"""
     rotation, translation = cam_from_world[..., :3, :3], cam_from_world[..., :3, 3]

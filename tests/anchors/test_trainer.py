@@ -164,7 +164,7 @@ def test_blocks_count_the_pixels_of_a_mask(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_periods_without_views_keep_their_features() -> None:
-    """Those of earlier stages of a sequential training are not to follow the new ones."""
+    """In a sequential training, features of earlier stages are not to follow the new ones."""
     every, spread = training_set(300, 40, 30), []
     for views in (every.views, tuple(view for view in every.views if view.period == 0)):
         method = make(replace(every, views=views), "chronogs", "fast", {"period_decay": 30.0})

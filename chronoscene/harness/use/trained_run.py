@@ -42,6 +42,7 @@ from chronoscene.methods import (
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS
 from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.scene.geometry import is_rotation
 from chronoscene.scene.similarity import Sim3
 
 NOT_RIGID = 1e-3  # Deviation from a rotation beyond which a pose is refused
@@ -207,9 +208,8 @@ class TrainedRun:
             )
         pose = np.asarray(cam_from_world, np.float64)
         check_shape("cam_from_world", pose, (4, 4))
-        squared = pose[:3, :3] @ pose[:3, :3].T
-        is_rigid = np.allclose(squared, np.eye(3), atol=NOT_RIGID)
-        if not (is_rigid and np.isfinite(pose).all() and pose[3].tolist() == [0, 0, 0, 1]):
+        is_rigid = is_rotation(pose[:3, :3], NOT_RIGID) and pose[3].tolist() == [0, 0, 0, 1]
+        if not (is_rigid and np.isfinite(pose).all()):
             raise ShapeError(
                 "cam_from_world",
                 expected="[[R, t], [0, 1]] with a rotation R and a finite translation t",

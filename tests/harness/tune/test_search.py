@@ -23,7 +23,7 @@ pytest.importorskip("optuna")
 
 @pytest.fixture
 def lines():
-    """What searches say."""
+    """Collect the lines that searches print."""
     return []
 
 
