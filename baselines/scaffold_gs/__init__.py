@@ -19,7 +19,7 @@ _SHORT: dict[str, Any] = {
 _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "fast": _SHORT | {"iterations": 1_000, "density_interval": 40},
-    "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
+    "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50, "opacity_dropout": 0.2},
     "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50, **MANY_ANCHORS},
 }
 
