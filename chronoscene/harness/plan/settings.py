@@ -141,8 +141,8 @@ class BenchSettings:
             "--jobs": self.jobs,
         }
         for option, number in counts.items():
-            if number is not None and number < 1:
-                raise _refused(option, "1 or more", number)
+            if number is not None and not (isinstance(number, Integral) and number >= 1):
+                raise _refused(option, "a whole number of 1 or more", number)
         for seed in self.seeds:
             if not (isinstance(seed, Integral) and 0 <= seed < 2**64):
                 raise _refused("--seed", "seeds from 0 to 2^64 - 1", seed)
