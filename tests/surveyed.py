@@ -75,11 +75,10 @@ class ToyRun:
     """A stand-in for a `TrainedRun` that renders the plane and the box."""
 
     def __init__(self, scene=None, *, noise=0.0, uses_period=True):
-        self.found, self.noise, self.uses_period = scene, noise, uses_period
+        self.found, self.noise, self.distinguishes_periods = scene, noise, uses_period
         self.num_periods, self.folder = 2, Path("run")
         self.record = SimpleNamespace(max_width=1600, label="site: toy", strategy="pooled")
         self.spec = SimpleNamespace(title="Toy")
-        self.strategy = SimpleNamespace(model_per_period=False)
 
     def render(self, camera, cam_from_world, period):
         return render(camera, cam_from_world, period, noise=self.noise)

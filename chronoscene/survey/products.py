@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from chronoscene.registration.report.coordinates import GEOREFERENCE
 from chronoscene.scene import Scene
 from chronoscene.statistics.measures import median_of
 from chronoscene.survey.cloud import PointCloud, dense_cloud, sparse_cloud
-from chronoscene.survey.difference import measure_volumes, subtract
+from chronoscene.survey.difference import Volumes, measure_volumes, subtract
 from chronoscene.survey.distances import measure_distances
 from chronoscene.survey.figure import draw_difference
 from chronoscene.survey.grid import Grid, choose_grid, natural_resolution
@@ -189,9 +189,10 @@ def write_survey(
         summary = survey_scene(scene, folder, options)
     else:
         summary = survey_run(run, scene, folder, options, report)
-        pairs = summary["pairs"]
-        rows = [dict(zip("ab", p["periods"], strict=True)) | v for p in pairs for v in p["volumes"]]
-        table = csv_text(list(rows[0]) if rows else [], [list(row.values()) for row in rows])
+        rows = [
+            (*pair["periods"], *v.values()) for pair in summary["pairs"] for v in pair["volumes"]
+        ]
+        table = csv_text(("a", "b", *(column.name for column in fields(Volumes))), rows)
         (folder / VOLUMES).write_text(table, encoding="utf-8", newline="\n")
     text = json.dumps(summary, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     (folder / SUMMARY).write_text(text, encoding="utf-8", newline="\n")
@@ -217,7 +218,7 @@ def survey_run(
         ConfigError: If an option does not fit, or the models do not know the periods.
         SceneError: If the scene has no metres, or its certificate is damaged.
     """
-    if options.pairs and not (run.uses_period or run.strategy.model_per_period):
+    if options.pairs and not run.distinguishes_periods:
         raise ConfigError(
             run.folder,
             expected="a run whose models know the periods",

@@ -72,24 +72,28 @@ def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Polygon]
     that is taken, also by `WHOLE`, gets the number, too.
 
     Raises:
-        ConfigError: If the file is damaged, has other geometries, or lies outside the map.
+        ConfigError: If the file is damaged or has other geometries, or one of them has no cell.
     """
     from rasterio.features import geometry_mask
 
     data = read_json_document(path, error=ConfigError)
-    features = data.get("features", [data])
+    features, raster = data.get("features", [data]), (grid.shape, _transform(grid))
     named: dict[str, Polygon] = {}
     for number, feature in enumerate(features if isinstance(features, list) else (), 1):
         place = f"--area {path}, feature {number}"
         shape = _on_map(place, data.get("crs"), feature, frame)
-        cells = geometry_mask([shape], grid.shape, _transform(grid), invert=True)
+        cells = geometry_mask([shape], *raster, invert=True)
         if not cells.any():
-            raise _wrong(place, "a polygon on the map", "one outside", "check its coordinates")
+            found, todo = "one outside", "check its coordinates"
+            if geometry_mask([shape], *raster, invert=True, all_touched=True).any():
+                found, todo = "one without the centre of a cell", "choose a finer --resolution"
+            raise _wrong(place, "a polygon on the map", found, todo)
         properties = feature.get("properties")
         given = properties.get("name") if isinstance(properties, dict) else None
         name = str(number if given is None else given)
-        polygon = Polygon(cells, _share_on_map(shape, cells, grid))
-        named[f"{name} ({number})" if name in (WHOLE, *named) else name] = polygon
+        while name in (WHOLE, *named):
+            name = f"{name} ({number})"
+        named[name] = Polygon(cells, _share_on_map(shape, cells, grid))
     if not named:
         raise _wrong(f"--area {path}", "polygons", "none", "draw at least one")
     return named
@@ -111,10 +115,10 @@ def _share_on_map(shape: Any, cells: Mask, grid: Grid) -> float:
 
 
 def _area(ring: Any) -> float:
-    """Area inside a closed ring, by the trapezoids under its edges."""
-    x, y = np.array([corner[:2] for corner in ring], np.float64).T
-    x, y = x - x[0], y - y[0]
-    return abs(float(np.sum((x[1:] - x[:-1]) * (y[1:] + y[:-1])))) / 2
+    """Area inside a ring, closed or not."""
+    corners = np.array([corner[:2] for corner in ring], np.float64)
+    x, y = (corners - corners[0]).T
+    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
 
 
 def _on_map(place: str, system: Any, feature: Any, frame: MapFrame) -> Any:
@@ -137,8 +141,10 @@ def _on_map(place: str, system: Any, feature: Any, frame: MapFrame) -> Any:
                 raise KeyError
         return shape if crs is None else transform_geom(crs, frame.crs, shape)
     except (CRSError, KeyError, TypeError, ValueError) as error:
-        wanted = "no crs, as the scene has none" if frame.is_local else "a known crs"
-        raise _wrong(place, wanted, repr(system)[:80], "convert the polygons") from error
+        wanted, todo = "a known crs", "convert the polygons"
+        if frame.is_local:
+            wanted, todo = "no crs, as the scene has none", "draw them in the metres of the scene"
+        raise _wrong(place, wanted, repr(system)[:80], todo) from error
 
 
 def _wrong(place: str, expected: str, found: str, todo: str) -> ConfigError:

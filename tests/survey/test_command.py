@@ -97,6 +97,18 @@ def test_a_pair_that_is_named_twice_is_compared_once(site, tmp_path):
     assert len((tmp_path / "out/volumes.csv").read_text().splitlines()) == 2
 
 
+def test_one_period_has_no_volumes(site, tmp_path):
+    run, toy = site
+    frames = toy.found.frames[:16]
+    points = replace(toy.found.points, track_frame=toy.found.points.track_frame % 16)
+    toy.num_periods = 1
+    toy.found = replace(toy.found, frames=frames, points=points, periods=toy.found.periods[:1])
+    assert survey(run, "--out", tmp_path / "out", "--resolution", "1").exit_code == 0
+    with open(tmp_path / "out/volumes.csv", newline="") as file:
+        rows = csv.DictReader(file)
+        assert not list(rows) and rows.fieldnames[:3] == ["a", "b", "polygon"]
+
+
 def test_a_scene_without_a_model_has_points_alone(tmp_path):
     scene = scene_format.write(make_scene(tmp_path), tmp_path / "site", image_source="none")
     result = survey(scene, "--out", tmp_path / "out")
@@ -182,7 +194,7 @@ def test_places_that_cannot_be_written(site, tmp_path):
 
 def test_a_run_that_does_not_know_the_periods(site, tmp_path):
     run, toy = site
-    toy.uses_period = False
+    toy.distinguishes_periods = False
     result = survey(run, "--out", tmp_path / "out")
     assert "a run whose models know the periods, found Toy under strategy pooled" in str(
         result.exception

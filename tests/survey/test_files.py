@@ -84,6 +84,8 @@ def test_a_cloud_with_a_point_far_away(tmp_path):
 
 SQUARE = np.array([[2, 2], [7, 2], [7, 5], [2, 5], [2, 2]]) + np.array([680_000.0, 5_151_990.0])
 
+SLIVER = np.array([[0.05, 0.05], [3.2, 0.05], [3.2, 0.2], [0.05, 0.2], [0.05, 0.05]])
+
 
 def geojson(ring, crs=None, **properties):
     shape = {"type": "Polygon", "coordinates": [np.asarray(ring).tolist()]}
@@ -131,6 +133,8 @@ def test_a_polygon_that_leaves_the_map(tmp_path):
     made = read(tmp_path, data)["1"]
     assert made.cells.sum() * 0.25 == 5 * 8 - 3 * 2
     assert made.on_map == pytest.approx((5 * 8 - 3 * 2) / (40 * 8 - 6 * 2))
+    unclosed = read(tmp_path, geojson(outer[:-1] + np.array([[0, 0], [0, 0], [9, 0], [9, 0]])))["1"]
+    assert unclosed.on_map == pytest.approx(unclosed.cells.sum() * 0.25 / (40 * 8))
     several = data["features"][0]["geometry"]
     several |= {"type": "MultiPolygon", "coordinates": [several["coordinates"], [SQUARE.tolist()]]}
     both = read(tmp_path, data)["1"]
@@ -141,6 +145,12 @@ def test_equal_names_stay_apart(tmp_path):
     data = geojson(SQUARE, name="pit")
     data["features"] *= 2
     assert list(read(tmp_path, data)) == ["pit", "pit (2)"]
+
+
+def test_a_name_that_looks_like_a_numbered_one(tmp_path):
+    data = geojson(SQUARE, name="pit (3)")
+    data["features"] += geojson(SQUARE, name="pit")["features"] * 2
+    assert list(read(tmp_path, data)) == ["pit (3)", "pit", "pit (3) (3)"]
 
 
 def test_names_that_are_empty_or_taken(tmp_path):
@@ -171,8 +181,9 @@ def test_properties_of_another_kind(tmp_path):
         (geojson([[2e2, 9e1], [1e300, 0], [0, 1], [2e2, 9e1]]), UTM, "on the map"),
         (geojson([[180, 90], [-180, 90], [0, -90], [180, 90]]), UTM, "on the map|expected"),
         (geojson(SQUARE + 1e4), UTM, "on the map, found one outside"),
+        (geojson(SQUARE[0] + SLIVER), UTM, "one without the centre of a cell; choose"),
         (geojson(SQUARE, "EPSG:nonsense"), UTM, "a known crs"),
-        (geojson(SQUARE, "EPSG:32632"), HERE, "no crs, as the scene has none"),
+        (geojson(SQUARE, "EPSG:32632"), HERE, "scene has none, .*draw them in the metres"),
         (geojson(SQUARE) | {"crs": 3}, UTM, "a known crs"),
     ],
 )

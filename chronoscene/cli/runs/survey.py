@@ -98,7 +98,7 @@ def _print(summary: Mapping[str, Any]) -> None:
         if pair["m3c2"] is None:
             say(f"no M3C2 of {name}: {pair['m3c2_absent']}", fg="yellow")
     if rows:
-        names = ("periods", "polygon", "area, m²", "fill, m³", "cut, m³", "net, m³")
+        names = ("periods", "polygon", "known, m²", "fill, m³", "cut, m³", "net, m³")
         title = "Volumes with their 95 % intervals"
         table = Table(names, rows, labels=2, title=title)
         emit(boxed_text(table, width=terminal_width()))
