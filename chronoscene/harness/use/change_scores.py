@@ -152,7 +152,8 @@ def changes_table(rows: Sequence[Compared], labels: Mapping[str, str], title: st
     """
     shown = [key for key in SCORES if any(key in scores for _, scores in rows)]
     heads: list[Head] = ["from", "to", "places"]
-    heads += [("of them [%]" if name == CLASSES[1] else "", name) for name in CLASSES[1:]]
+    groups = {"unknown": "of them [%]", "gone": "of its period [%]"}
+    heads += [(groups.get(name, ""), name) for name in CLASSES[1:]]
     heads += [SCORES[key] for key in shown]
     lines = []
     for made, scores in rows:
