@@ -11,6 +11,7 @@ from chronoscene.cli.output import check_place, emit, report_written, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.harness.use.page import PageSummary, check_runs, chosen_periods, write_page
 from chronoscene.harness.use.trained_run import open_run
+from chronoscene.io.wording import counted
 
 
 @click.command("page")
@@ -64,13 +65,15 @@ def _text(summary: PageSummary) -> str:
     for packed in summary.packed:
         total = sum(packed.periods)
         lines.append(
-            f"{total:,} Gaussians of {len(packed.periods)} periods: {packed.stored:,} stored, with "
-            f"{packed.centres:,} centres"
+            f"{total:,} Gaussians of {counted(len(packed.periods), 'period')}: {packed.stored:,} "
+            f"stored, with {packed.centres:,} centres"
         )
     sizes = f"Gaussians {summary.gaussians / 1e6:.1f} MB, photos {summary.photos / 1e6:.1f} MB"
     lines.append(f"{summary.total / 1e6:.1f} MB: {sizes}")
     if str(summary.reduction):
         lines.append(f"To keep --max-megabytes, left out: {summary.reduction}")
     if summary.missing_photos:
-        lines.append(f"To keep --max-megabytes, left out: {summary.missing_photos} photos")
+        lines.append(
+            f"To keep --max-megabytes, left out: {counted(summary.missing_photos, 'photo')}"
+        )
     return "\n".join(lines) + "\n"

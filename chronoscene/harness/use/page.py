@@ -21,6 +21,7 @@ from chronoscene.images.store import ImageStore
 from chronoscene.io.pages import render_page
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import staged_folder
+from chronoscene.io.wording import counted
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.geometry import camera_centre
@@ -90,7 +91,7 @@ def write_page(
     frames = [frame for frame in scene.frames if frame.period in periods]
     with staged_folder(out) as staged:
         clouds = _gaussians(runs, scene, periods, page_from_world, report)
-        document = _document(runs, scene, frames, periods, page_from_world, clouds[0][0])
+        document = _document(runs, scene, frames, periods, page_from_world)
         photos = _Photos(runs[0].photos(scene), staged)
         room = max_bytes - _size_of_rest(document, runs, periods)
         for frame in _test_first(frames):
@@ -178,13 +179,11 @@ def _document(
     frames: Sequence[Frame],
     periods: Sequence[int],
     page_from_world: Sim3,
-    cloud: GaussianCloud,
 ) -> dict[str, Any]:
     """Collect what the page knows beside the Gaussians, in its frame and axes."""
     store = runs[0].photos(scene)
     poses = page_from_world.apply_to_pose(np.stack([frame.cam_from_world for frame in frames]))
-    points = scene.points.xyz[scene.points.finite]
-    middle = page_from_world.apply(points) if len(points) else cloud.means.astype(np.float64)
+    middle = page_from_world.apply(scene.points.xyz[scene.points.finite])
     start = orbit(poses, middle, 1)[0]
     distance = STEP_BACK * np.linalg.norm(camera_centre(start) - np.median(middle, axis=0))
     start[2, 3] += distance * (1 - 1 / STEP_BACK)
@@ -331,7 +330,7 @@ def _page(
     if str(reduction):
         notes.append(f"To keep the page small, it lacks {reduction}.")
     if missing:
-        notes.append(f"To keep the page small, {missing} photos are not in it.")
+        notes.append(f"To keep the page small, it lacks {counted(missing, 'photo')}.")
     names = " and ".join(dict.fromkeys(run.spec.title for run in runs))
     data = json.dumps(document, ensure_ascii=False, separators=(",", ":"))
     return render_page(

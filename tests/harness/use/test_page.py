@@ -124,7 +124,9 @@ def test_a_place_that_is_not_finite_leaves_the_first_view(trained, tmp_path):
 
 
 def test_one_period_of_two_methods(trained, tmp_path):
-    make_page([trained["chronogs"], trained["4dgs"]], tmp_path / "page", "--period", "autumn")
+    runs = [trained["chronogs"], trained["4dgs"]]
+    said = make_page(runs, tmp_path / "page", "--period", "autumn")
+    assert said.count("Gaussians of 1 period: ") == 2
     scene = scene_of(tmp_path / "page")
     assert scene["periods"] == ["autumn"] and len(scene["runs"]) == 2
     assert len(scene["frames"]) == 4
@@ -211,15 +213,15 @@ console.log(moves);
 """
 
 
-def in_node(*scripts, then):
-    """Run some scripts of the page with a few more lines, without a browser; return the output."""
+def in_node(*scripts, then, first=""):
+    """Run some scripts of the page between other lines, without a browser; return the output."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("no node here")
     texts = [
         (TEMPLATES / "run_page" / f"{name}.js").read_text(encoding="utf-8") for name in scripts
     ]
-    text = "\n".join([*texts, then])
+    text = "\n".join([first, *texts, then])
     done = subprocess.run([node, "-e", text], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -249,6 +251,21 @@ def test_a_link_to_half_a_run_is_refused():
     run, period, problems = json.loads(in_node("link", then=then))
     assert run is None and period == 0.5
     assert problems == ["The link asks for run 0.5, but here are 0 to 1."]
+
+
+def test_a_link_to_a_photo_beside_another_period():
+    first = """
+        globalThis.matchMedia = () => ({});
+        globalThis.location = { hash: "#period=2&camera=a" };"""
+    then = """
+        const app = Object.create(App.prototype), frames = [{ name: "a", period: 0 }];
+        app.scene = { periods: ["x", "y", "z"], runs: [{}], frames };
+        Object.assign(app, { mode: "years", run: 0, sets: [[]], view: {} });
+        app.panel = { showPhoto() {} };
+        app.flyTo = app.setMode = () => {};
+        app.applyAddress();
+        console.log(app.frame.name, app.period);"""
+    assert in_node("link", "app", first=first, then=then) == "a 2\n"
 
 
 def pixels(page, **options):

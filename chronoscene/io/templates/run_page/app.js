@@ -240,12 +240,12 @@ class App {
   /** Show what the address asks for. */
   applyAddress() {
     const problems = [], state = stateFrom(location.hash.slice(1), this.scene, problems);
+    if (state.view) this.view = { ...this.scene.home, ...state.view };
+    if (state.frame) this.visit(state.frame);  // goes to its period, which may not be the one shown
+    else this.leave();
     for (const name of ["period", "run", "pair", "wipe"]) {
       if (state[name] !== undefined) this[name] = state[name];
     }
-    if (state.view) this.view = { ...this.scene.home, ...state.view };
-    if (state.frame) this.visit(state.frame);
-    else this.leave();
     this.setMode(state.mode || "years");
     if (problems.length) this.panel.say(problems.join(" "));
   }
