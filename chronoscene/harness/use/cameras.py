@@ -257,7 +257,8 @@ def _of_path(run: TrainedRun, path: Path) -> CameraSequence:
             values = np.reshape(np.array(values, object), (4, 4)).tolist()
         pose = transforms.pose_from_opengl(place, transforms.matrix(place, values))
         time = number(place, item, "render_time")
-        period = None if time is None else time * (run.num_periods - 1)
+        # Rounded: of 23 periods, that of number 15 is at 15 / 22, and 15 / 22 * 22 is not 15.
+        period = None if time is None else round(time * (run.num_periods - 1), 6)
         viewpoints.append(
             Viewpoint(_numbered(i), camera, world_from_file.apply_to_pose(pose), period)
         )

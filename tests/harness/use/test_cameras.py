@@ -12,6 +12,7 @@ from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.shared.transforms import opengl_from_pose
 from chronoscene.harness.use.cameras import NORMALISED, OrbitShape, find_viewpoints, with_periods
 from chronoscene.harness.use.trained_run import open_run
+from chronoscene.harness.view.paths import KeyView, path_file
 from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
 
@@ -110,6 +111,16 @@ def test_times_of_a_camera_path_are_periods(run, tmp_path):
     (tmp_path / "path.json").write_text(json.dumps(document))
     viewpoints = with_periods(viewpoints_of(run, tmp_path / "path.json"), run, (), 5)
     assert [viewpoint.period for viewpoint in viewpoints] == [0, 0.25, 1]
+
+
+def test_whole_periods_of_a_camera_path_stay_whole(run, tmp_path):
+    labels = {str(i): str(i) for i in range(23)}
+    many = replace(run, record=run.record.model_copy(update={"period_labels": labels}))
+    views = [KeyView(run.scene().frames[0].cam_from_world, 1.0, i) for i in range(23)]
+    data = path_file(views, 23 / 24, (4, 3), 23, whole=True)
+    (tmp_path / "path.json").write_bytes(data)
+    viewpoints = viewpoints_of(many, tmp_path / "path.json").viewpoints
+    assert [viewpoint.period for viewpoint in viewpoints] == [*range(23)]
 
 
 def test_the_frame_of_a_model_of_nerfstudio_is_undone(run, tmp_path):
