@@ -130,7 +130,7 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
 
     Raises:
         ConfigError: If the run has stages or is a compressed one, there is one like this already,
-            or the method has no anchors or Gaussians.
+            the method has no anchors or Gaussians, or the ground truth is missing.
         SceneError: If the folder of the new run is in use.
     """
     if run.strategy.in_order:
@@ -159,6 +159,14 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
             found="one",
             todo="use it, or delete it to compress the run again",
         )
+    truth = ground_truth_folder(out.parents[2], run.record.scene)
+    if not truth.is_dir():
+        raise ConfigError(
+            run.folder,
+            expected="a run in the folder that bench wrote, with photos to score it by",
+            found=f"no {truth}",
+            todo="copy the whole folder of runs there",
+        )
     with staged_folder(out) as staged:
         for number in range(run.num_periods) if run.strategy.model_per_period else (None,):
             part = "" if number is None else period_part(number)
@@ -176,7 +184,7 @@ def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: 
         document["config_hash"] = config_hash(document["config"])
         write_text_atomic(staged / CONFIG_FILE, json.dumps(document, indent=1) + "\n")
         log("score")
-        _score(replace(run, folder=staged, _models={}), scene, store, variant, out.parents[2])
+        _score(replace(run, folder=staged, _models={}), scene, store, variant, truth)
     write_summary(out.parents[2])
     return out
 
@@ -276,7 +284,7 @@ def _sensitivity(model: _SortedModel, rules: Mapping[str, Columns], log: Log) ->
     return found
 
 
-def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, runs: Path) -> None:
+def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, truth: Path) -> None:
     """Render the test views of a run whose folder has its models, and write its record."""
     writer, seconds = ImageWriter(run.folder / PREDICTIONS), 0.0
     frames = scene.select(split="test")
@@ -297,7 +305,6 @@ def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, runs:
         "config_hash": read_config(run.folder)["config_hash"],
         "render_seconds": seconds / len(frames) if frames else None,
     }
-    truth = ground_truth_folder(runs, run.record.scene)
     score_run(run.folder, run.record.model_copy(update=changed), truth, make_scorers())
 
 

@@ -149,6 +149,7 @@ def test_the_model_of_a_period_is_judged_by_photos_of_that_period(
     make_scene, tmp_path, monkeypatch
 ):
     judged = []
+    (tmp_path / "ground_truth/scene").mkdir(parents=True)
 
     @contextmanager
     def opened(run, period, scene, frames):
@@ -164,7 +165,7 @@ def test_the_model_of_a_period_is_judged_by_photos_of_that_period(
     ):
         run = SimpleNamespace(
             strategy=STRATEGIES[strategy],
-            record=SimpleNamespace(variant=""),
+            record=SimpleNamespace(variant="", scene="scene"),
             photos=ImageStore,
             folder=tmp_path / "scene/method/seed0",
             num_periods=2,
@@ -180,6 +181,13 @@ def test_a_run_in_stages_is_refused(copied):
     staged = replace(run, record=run.record.model_copy(update={"strategy": "sequential"}))
     with pytest.raises(ConfigError, match=r"one model, or one per period.*sequential"):
         compress_run(staged, run.scene(), max_loss=None, log=print)
+
+
+def test_a_run_away_from_its_ground_truth_is_refused_before_long_work(copied):
+    run = open_run(folder := copied("chronogs"))
+    shutil.rmtree(folder.parents[2] / "ground_truth")
+    with pytest.raises(ConfigError, match=r"found no .*ground_truth.*copy the whole folder"):
+        compress_run(run, run.scene(), max_loss=0.1, log=pytest.fail)
 
 
 @pytest.mark.slow
