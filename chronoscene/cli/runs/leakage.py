@@ -55,8 +55,8 @@ def command(
     found = run.scene(scene)
     place = truth or found.root / "gt"
     tests = len(found.select(split="test"))
-    views = tracked(measure_leakage(run, found, place), "render", total=tests)
-    rows = [row for view in views for row in view]
+    views = measure_leakage(run, found, place) if place.is_dir() else ()
+    rows = [row for view in tracked(views, "render", total=tests) for row in view]
     there = {(row.region, row.metric) for row in rows if row.camera_period != row.rendered_period}
     if not there:
         raise ConfigError(

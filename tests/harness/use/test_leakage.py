@@ -20,7 +20,7 @@ from chronoscene.harness.use.leakage import (
     measure_leakage,
     pair_values,
 )
-from chronoscene.harness.use.trained_run import open_run
+from chronoscene.harness.use.trained_run import TrainedRun, open_run
 from chronoscene.images.decoding import load_rgb
 from chronoscene.images.store import ImageStore
 from chronoscene.images.truth import APPEARANCE, GEOMETRY, truth_place
@@ -235,6 +235,7 @@ def test_the_command_prints_a_table(run, truth, tmp_path):
     assert "no truth, or nothing rendered, for: AP appearance, AbsRel, RMSE, delta" in result.stderr
 
 
-def test_a_scene_without_truth(run):
+def test_a_scene_without_truth_is_refused_before_long_work(run, monkeypatch):
+    monkeypatch.setattr(TrainedRun, "render", pytest.fail)
     with pytest.raises(ConfigError, match=r"gt: expected change masks, .*found none .* --truth"):
         leakage(run.folder)
