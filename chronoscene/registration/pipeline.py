@@ -27,7 +27,7 @@ from chronoscene.registration.reconstruct.extension import add_period
 from chronoscene.registration.report.coordinates import placed_model, write_coordinates
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
-from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
+from chronoscene.registration.ties.tie_points import TiePoints, by_photo, read_tie_points
 from chronoscene.registration.work_folder import Stages, work_folder
 from chronoscene.scene import Scene
 from chronoscene.undistort import undistort
@@ -59,8 +59,8 @@ def run(
     Raises:
         RegistrationError: If there is no model, or none of the photos can be placed; what was
             computed is kept in the work folder.
-        SceneError: If ``out`` is in use, tie points do not suffice or have no clicks, or ``into``
-            has distortion.
+        SceneError: If ``out`` is in use, tie points do not suffice, have no clicks or do not say
+            in which photos, or ``into`` has distortion.
         ConfigError: If tie points are given together with ``into``, or the reference system is
             unsuitable.
     """
@@ -92,6 +92,8 @@ def run(
     with work_folder(work) as lock:
         context = Context(work, Stages(work), options, report, lock)
         inputs = gather(captures, into, context)
+        if points is not None:
+            points = by_photo(points, sorted(inputs.periods))
         matched = find_matches(inputs, context)
         ties: TieAlignment | None
         if options.route == "resection" and points is not None:

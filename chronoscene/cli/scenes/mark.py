@@ -14,8 +14,8 @@ from chronoscene.geodesy import read_reference_system
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import counted
 from chronoscene.registration.photos.captures import photo_folders, read_captures
-from chronoscene.registration.report.marking import clicks_elsewhere, marking_page
-from chronoscene.registration.ties.tie_points import read_tie_points
+from chronoscene.registration.report.marking import marking_page
+from chronoscene.registration.ties.tie_points import by_photo, read_tie_points
 
 
 @click.command("mark")
@@ -72,16 +72,19 @@ def command(
         points = read_tie_points(tie_points, scale=tie_scale, crs=system)
     with progress_bar(f"read {captures}") as report:
         read = read_captures(captures, table=table)
-        found = read.images
+        found, names = read.images, [c.name for c in read.images]
+        if points is not None:
+            points = by_photo(points, names)
         text = marking_page(
             found, points=points, model=model, max_size=max_size, title=page.stem, report=report
         )
     write_text_atomic(page, text)
     for name, _, reason in read.refused:
         say(f"note: {name} is not on the page: {reason}")
-    if points is not None and (others := clicks_elsewhere(points, found)):
+    clicks = [] if points is None else [c.image for p in points.points for c in p.clicks]
+    if others := [image for image in clicks if image not in names]:
         say(
             f"note: {counted(len(others), 'click')} in photos that are not in CAPTURES, such as "
-            f"{others[0].image!r}: the page does not show them, but saves them with the others"
+            f"{others[0]!r}: the page does not show them, but saves them with the others"
         )
     emit(f"{page}: {len(found)} photos, {len(text) / 1e6:.1f} MB; open it in a browser\n")

@@ -21,7 +21,7 @@ from chronoscene.registration.ties.tie_alignment import (
     align_with_tie_points,
     control_frame,
 )
-from chronoscene.registration.ties.tie_points import TiePoint, TiePoints, match_images
+from chronoscene.registration.ties.tie_points import TiePoint, TiePoints
 
 
 def check_options(options: Options) -> None:
@@ -44,14 +44,12 @@ def resect_photos(
     """Place the photos by the control, and compare it with the result."""
     frame = control_frame(points)
     known = points.located(frame)
-    names = sorted(inputs.periods)
-    index = match_images(points, names)
 
     def argument(point: TiePoint, xyz: Array | None) -> dict[str, Any]:
         sigma = None
         if xyz is not None:
             sigma = list(point.sigma or (LEAST_SIGMA,) * 3)
-        clicks = [[names[i], c.x, c.y] for c in point.clicks if (i := index[c.image]) is not None]
+        clicks = [[c.image, c.x, c.y] for c in point.clicks if c.image in inputs.periods]
         place = None if xyz is None else xyz.tolist()
         return {"name": point.name, "xyz": place, "sigma": sigma, "clicks": clicks}
 

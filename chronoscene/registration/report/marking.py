@@ -19,7 +19,7 @@ from chronoscene.io.pages import data_uri, render_page
 from chronoscene.io.processes import Report
 from chronoscene.registration.photos.inputs import plain_names
 from chronoscene.registration.photos.photo import Capture
-from chronoscene.registration.ties.tie_points import Click, TiePoints, match_images
+from chronoscene.registration.ties.tie_points import TiePoints
 from chronoscene.scene.cameras import CAMERA_MODELS, PINHOLE_MODELS, POLYNOMIAL_MODELS
 from chronoscene.scene.geometry import camera_centre
 
@@ -45,7 +45,8 @@ def marking_page(
 
     Args:
         captures: The photos.
-        points: Points to start with; clicks in other photos are saved with them, and not shown.
+        points: Points to start with, with the names of the photos (`tie_points.by_photo`); clicks
+            in others are saved with them, and not shown.
         model: Folder of a COLMAP model of these photos, by which places are predicted.
         max_size: Pixels of the longer side of an embedded photo.
         title: Of the page.
@@ -60,7 +61,7 @@ def marking_page(
             report("photos", i, len(captures))
         image = posed.get(name) or posed.get(f"{name}.png")
         photos.append(_photo(capture, image, max_size))
-    state = {"points": [] if points is None else _points(points, names)}
+    state = {"points": [] if points is None else _points(points)}
     data = {
         "photos": photos,
         "state": state,
@@ -99,26 +100,17 @@ def _photo(capture: Capture, image: PosedImage | None, max_size: int) -> dict[st
     }
 
 
-def _points(points: TiePoints, names: Sequence[str]) -> list[dict[str, Any]]:
-    index = match_images(points, names)
+def _points(points: TiePoints) -> list[dict[str, Any]]:
     return [
         {
             "name": p.name,
             "role": p.role,
             "world": "" if p.world is None else " ".join(map(repr, p.world)),
             "sigma": "" if p.sigma is None else " ".join(map(repr, p.sigma)),
-            "marks": {
-                c.image if (i := index[c.image]) is None else names[i]: [c.x, c.y] for c in p.clicks
-            },
+            "marks": {c.image: [c.x, c.y] for c in p.clicks},
         }
         for p in points.points
     ]
-
-
-def clicks_elsewhere(points: TiePoints, captures: Sequence[Capture]) -> list[Click]:
-    """Return the clicks in photos that a page of the captures does not show."""
-    index = match_images(points, [c.name for c in captures])
-    return [c for p in points.points for c in p.clicks if index[c.image] is None]
 
 
 def _depths(model: Model) -> tuple[float, float]:

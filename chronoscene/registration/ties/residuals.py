@@ -16,7 +16,7 @@ from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, place, project, rays_at
 from chronoscene.registration.result import Registered
-from chronoscene.registration.ties.tie_points import Role, TiePoints, match_images
+from chronoscene.registration.ties.tie_points import Role, TiePoints
 
 OUTLIER_PIXELS = 12.0
 """A click with a smaller error is no outlier: people click to within a few pixels."""
@@ -72,13 +72,16 @@ class Clicks:
 
 
 def clicks_of(model: Registered, tie_points: TiePoints) -> tuple[Clicks, list[str]]:
-    images = match_images(tie_points, model.names)
-    missing = sorted(name for name, i in images.items() if i is None)
-    remarks = [f"{name}: has clicks, but is not registered" for name in missing]
+    images = {name: i for i, name in enumerate(model.names)}
+    remarks = [
+        f"{name}: has clicks, but "
+        + ("is not registered" if name in model.unregistered else "there is no such photo")
+        for name in sorted(tie_points.images - images.keys())
+    ]
     track, image, xy = [], [], []
     for number, point in enumerate(tie_points.points):
         for click in point.clicks:
-            index = images[click.image]
+            index = images.get(click.image)
             if index is None:
                 continue
             camera = model.cameras[index]

@@ -37,7 +37,7 @@ from chronoscene.registration.ties.residuals import (
     with_errors,
     with_tie_tracks,
 )
-from chronoscene.registration.ties.tie_points import TiePoints, match_images
+from chronoscene.registration.ties.tie_points import TiePoints
 from chronoscene.scene.similarity import Sim3, fit_few
 from chronoscene.scene.tracks import track_owners
 
@@ -80,7 +80,7 @@ def align_with_tie_points(
 
     Args:
         model: Its periods may be in frames of their own.
-        tie_points: From `chronoscene.registration.ties.tie_points.read_tie_points`.
+        tie_points: With the names of the photos (`tie_points.by_photo`).
         mode: ``check`` only moves the whole model to ground control; ``replace`` also aligns all
             periods again; ``auto`` does so if the points do not fit.
         output: Reference system of the errors; None for the frame of the model.
@@ -164,8 +164,7 @@ def _align_periods(
 
 
 def _too_few(model: Registered, tie_points: TiePoints, period: int, count: int) -> SceneError:
-    images = match_images(tie_points, model.names)
-    missing = sorted(name for name, i in images.items() if i is None)
+    missing = sorted(tie_points.images.difference(model.names))
     also = f", and clicks in {len(missing)} photos without a pose: " if missing else ""
     also += ", ".join(missing[:5]) + (" ..." if len(missing) > 5 else "")
     return SceneError(

@@ -90,6 +90,11 @@ class TiePoints:
     crs: ReferenceSystem | None
     """Reference system of the world coordinates; None for that of the model."""
 
+    @property
+    def images(self) -> set[str]:
+        """Images with clicks."""
+        return {c.image for p in self.points for c in p.clicks}
+
     def names(self, role: Role) -> set[str]:
         """Names of the points of a role."""
         return {p.name for p in self.points if p.role == role}
@@ -340,35 +345,41 @@ def _projection(path: Path, line: str) -> ReferenceSystem:
     return read_reference_system(f"{path}:1", text)
 
 
-def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int | None]:
-    """Index of the model's image for each image with clicks; None where the model lacks it.
+def by_photo(tie_points: TiePoints, names: Sequence[str]) -> TiePoints:
+    """Give clicks the full names of their photos; a name that fits none stays.
 
     An image may be named by its whole path or by the end of it, where that is unique, and as it
     was before registration, which replaces blanks and converts some photos to PNG.
 
+    Args:
+        tie_points: From `read_tie_points`.
+        names: All photos, because one that gets no pose may be the one that is meant.
+
     Raises:
-        SceneError: If the end of a path fits several images, or no click fits the model at all.
+        SceneError: If a name fits several photos, or no click fits any at all.
     """
-    index = {name: i for i, name in enumerate(names)}
-    found: dict[str, int | None] = {}
+    fits: dict[str, list[str]] = {}
     for click in (c for p in tie_points.points for c in p.clicks):
-        if click.image in found:
-            continue
-        ends = _names_of(click.image, names)
-        if len(ends) > 1:
+        if click.image not in fits:
+            fits[click.image] = _names_of(click.image, names)
+        if len(ends := fits[click.image]) > 1:
             raise _wrong(
                 tie_points.path, click.line, "the name of one image",
                 f"{click.image!r}, which fits {ends[0]} and {ends[1]}",
                 "write the name with its folder, as in the scene",
             )  # fmt: skip
-        found[click.image] = index[ends[0]] if ends else None
-    if found and all(i is None for i in found.values()):
+    if fits and not any(fits.values()):
         first = next(c for p in tie_points.points for c in p.clicks)
         raise _wrong(
-            tie_points.path, first.line, "images that are registered, such as "
-            f"{names[0] if names else '(there are none)'}", first.image, "correct the names",
+            tie_points.path, first.line, f"names of photos, such as {names[0]}", first.image,
+            "correct the names",
         )  # fmt: skip
-    return found
+    full = {image: ends[0] for image, ends in fits.items() if ends}
+    points = (
+        replace(p, clicks=tuple(replace(c, image=full.get(c.image, c.image)) for c in p.clicks))
+        for p in tie_points.points
+    )
+    return replace(tie_points, points=tuple(points))
 
 
 def _names_of(image: str, names: Sequence[str]) -> list[str]:

@@ -224,3 +224,19 @@ def test_options_without_an_effect_are_refused(
     done = call(photos(tmp_path / "in/a", 3), tmp_path / "out", option, value, *other)
     assert str(done.exception).startswith(f"{option}: expected no such option {condition}")
     assert not (tmp_path / "out.work").exists()
+
+
+def test_a_click_that_may_mean_either_of_two_photos_is_refused_before_features(
+    tmp_path: Path,
+) -> None:
+    """Later, one of them could have no pose, and the click would count for the other."""
+    photos(tmp_path / "in/a", 2)
+    for file in sorted(photos(tmp_path / "in/b", 2).iterdir()):
+        Image.new("RGB", (640, 480), (200, 60 * int(file.stem), 0)).save(file)
+    clicks = tmp_path / "clicks.csv"
+    clicks.write_text("p,a/0.jpg,1,2\np,1.jpg,3,4\n")
+    done = call(tmp_path / "in", tmp_path / "out", "--tie-points", clicks)
+    assert isinstance(done.exception, SceneError), done.output
+    assert done.exception.place == f"{clicks}:2"
+    assert done.exception.found == "'1.jpg', which fits a/1.jpg and b/1.jpg"
+    assert not (tmp_path / "out.work/features.db").exists()

@@ -282,7 +282,7 @@ def test_control_and_clicks_that_take_no_part_are_named(tmp_path: Path, made: Ge
     points = read_tie_points(file)
     ties = align_with_tie_points(made.model, points, output=UTM)
     lines = inspect_registration(ties.model, tmp_path, ties=ties).summary.splitlines()
-    assert "  tie points: 2016/typo.jpg: has clicks, but is not registered" in lines
+    assert "  tie points: 2016/typo.jpg: has clicks, but there is no such photo" in lines
     few = "2 control points can be placed; three that are not collinear are needed"
     assert f"  tie points: {few}" in lines
 

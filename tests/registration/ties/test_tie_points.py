@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.ties.residuals import with_tie_tracks
 from chronoscene.registration.ties.tie_alignment import align_with_tie_points, move_periods
-from chronoscene.registration.ties.tie_points import TiePoints, match_images, read_tie_points
+from chronoscene.registration.ties.tie_points import TiePoints, by_photo, read_tie_points
 from chronoscene.scene.similarity import Sim3
 
 CORNERS = np.array(
@@ -181,30 +182,33 @@ def test_world_coordinates_beside_every_name_of_pixels(tmp_path: Path, header: s
     assert read(tmp_path, "Point,Image,X,Y\np,a.jpg,1,2\n").points[0].clicks[0].y == 2.0
 
 
+def images(points: TiePoints, names: Sequence[str]) -> list[str]:
+    return [c.image for p in by_photo(points, names).points for c in p.clicks]
+
+
 def test_images_may_have_their_names_of_before_registration(tmp_path: Path) -> None:
     points = read(tmp_path, "p,2016/a b.jpg,1,2\np,c d.tif,1,2\n")
-    before, after = ("2016/a b.jpg", "2016/c d.tif"), ("2016/a_b.jpg", "2016/c_d.tif.png")
+    before, after = ["2016/a b.jpg", "2016/c d.tif"], ["2016/a_b.jpg", "2016/c_d.tif.png"]
     for names in (before, after):
-        assert match_images(points, names) == {"2016/a b.jpg": 0, "c d.tif": 1}
+        assert images(points, names) == names
 
 
 def test_a_name_with_blanks_that_may_be_either_of_two_photos(tmp_path: Path) -> None:
     names = plain_names(["a_b.jpg", "a b.jpg"])
     points = read(tmp_path, "p,a b.jpg,1,2\n")
     with pytest.raises(SceneError, match=r"'a b.jpg', which fits a_b.jpg and a_b_2.jpg; .* scene"):
-        match_images(points, names)
-    points = read(tmp_path, "p,a_b.jpg,1,2\np,a_b_2.jpg,1,2\n")
-    assert match_images(points, names) == {"a_b.jpg": 0, "a_b_2.jpg": 1}
+        by_photo(points, names)
+    assert images(read(tmp_path, "p,a_b.jpg,1,2\np,a_b_2.jpg,1,2\n"), names) == names
 
 
 def test_images_are_found_by_the_end_of_their_path(tmp_path: Path) -> None:
     names = ("2016/a.jpg", "2016/b_c.jpg", "2018/b_c.jpg", "2018/d.jpg")
-    found = match_images(read(tmp_path, "p,a.jpg,1,2\np,2018/b c.jpg,1,2\np,zz.jpg,1,2\n"), names)
-    assert found == {"a.jpg": 0, "2018/b c.jpg": 2, "zz.jpg": None}
+    points = read(tmp_path, "p,a.jpg,1,2\np,2018/b c.jpg,1,2\np,zz.jpg,1,2\n")
+    assert images(points, names) == ["2016/a.jpg", "2018/b_c.jpg", "zz.jpg"]
     with pytest.raises(SceneError, match=r"ties.csv:1: .*2016/b_c.jpg and 2018/b_c.jpg"):
-        match_images(read(tmp_path, "p,b_c.jpg,1,2\n"), names)
-    with pytest.raises(SceneError, match="registered"):
-        match_images(read(tmp_path, "p,other.jpg,1,2\n"), names)
+        by_photo(read(tmp_path, "p,b_c.jpg,1,2\n"), names)
+    with pytest.raises(SceneError, match=r"names of photos, such as 2016/a.jpg, found other.jpg"):
+        by_photo(read(tmp_path, "p,other.jpg,1,2\n"), names)
 
 
 def test_a_failed_alignment_is_replaced(tmp_path: Path, apart: Generated) -> None:
