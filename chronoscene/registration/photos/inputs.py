@@ -95,7 +95,7 @@ class PhotoInputs:
         periods = np.array([c.period for c in self.images], np.int64)
         middles = {}
         for p in np.unique(periods).tolist():
-            known = self.positions.enu[periods == p]
+            known = self.positions.enu[periods == p, :2]  # heights may be of another kind
             known = known[np.isfinite(known).all(axis=1)]
             if len(known):
                 middles[p] = np.median(known, axis=0)
@@ -106,7 +106,7 @@ class PhotoInputs:
                 continue
             others = [m for q, m in middles.items() if q != p]
             if self.scene is not None and self.georeference is not None:
-                others.append(np.zeros(3))
+                others.append(np.zeros(2))
             away = min((float(np.linalg.norm(middle - m)) for m in others), default=0.0)
             if away > FAR_METRES:
                 found[p] = f"{away / 1000:,.0f} km from the other dates by GPS: {ANOTHER_PLACE}"
@@ -213,12 +213,15 @@ def _new_period(captures: Captures) -> tuple[str, str | None]:
 
 
 def _as_new_period(captures: Sequence[Capture], scene: Scene, label: str) -> tuple[Capture, ...]:
-    """Renumber captures as the period after those of a scene, under names new to the scene."""
+    """Renumber captures as the period after those of a scene, under names new to the scene.
+
+    They are still new to it where `place_photos` changes them.
+    """
     taken = {f.name for f in scene.frames}
     new = []
     for capture in captures:
         name = capture.name if "/" in capture.name else f"{label}/{capture.name}"
-        while name in taken:
+        while not taken.isdisjoint((name, plain := re.sub(r"\s", "_", name), f"{plain}.png")):
             name = f"new/{name}"
         taken.add(name)
         new.append(replace(capture, name=name, period=scene.num_periods))

@@ -148,6 +148,31 @@ def test_a_period_of_another_place_is_said_to_be_one(folder: Path) -> None:
     assert next(iter(found.values())).endswith(ANOTHER_PLACE)
 
 
+def test_photos_without_heights_are_not_far_below_a_scene(folder: Path) -> None:
+    for i in range(4):
+        save(folder / f"{i}.jpg", i)
+    captures = read_captures(folder)
+    flat = [placed(c, 51.0) for c in captures.images]
+    images = tuple(replace(c, gps=replace(c.gps, altitude=None)) for c in flat if c.gps)
+    frame = Georeference(51.0, 11.0, 2500.0, height_kind="as stated")
+    scene: Any = SimpleNamespace()
+    found = replace(gathered(images, captures), scene=scene, georeference=frame)
+    assert replace(found, positions=locate(images, frame)).far() == {}
+
+
+def test_new_photos_have_names_that_the_scene_lacks_once_they_are_placed(
+    folder: Path, tmp_path: Path
+) -> None:
+    save(folder / "site A/0.jpg", 0)
+    save(folder / "site A/1.jpg", 1)
+    save(folder / "site A/2.tif", 2, mode="RGBA")
+    frames = [SimpleNamespace(name=name) for name in ("site_A/0.jpg", "site_A/2.tif.png")]
+    scene: Any = SimpleNamespace(frames=frames, num_periods=1)
+    new = inputs._as_new_period(read_captures(folder).images, scene, "later")
+    names, _ = inputs.place_photos(new, tmp_path / "photos")
+    assert names == ["new/site_A/0.jpg", "site_A/1.jpg", "new/site_A/2.tif.png"]
+
+
 def test_the_first_stage_depends_on_the_images_of_a_scene_that_is_extended(folder: Path) -> None:
     for name in ("captures/0.jpg", "old/1.jpg"):
         save(folder / name, len(name))
