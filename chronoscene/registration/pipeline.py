@@ -176,7 +176,7 @@ def _log(registered: Registered, inputs: PhotoInputs, context: Context) -> dict[
         "options": context.options.record(),
         "route": registered.route,
         "unit": registered.unit,
-        "periods": registered.counts(inputs.totals()),
+        "periods": registered.counts(),
         "unregistered": [
             {"image": name, "period": registered.unregistered_periods[name], "reason": reason}
             for name, reason in sorted(registered.unregistered.items())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -120,14 +120,11 @@ class Registered:
         """``metre``, or ``unknown``."""
         return "unknown" if self.georeference is None else "metre"
 
-    def counts(self, totals: Sequence[int]) -> list[dict[str, Any]]:
-        """Count the photos of each period, of ``totals`` in all, for the log."""
+    def counts(self) -> list[dict[str, Any]]:
+        """Count the photos of each period, those that cannot be used among them."""
+        placed = np.bincount(self.periods, minlength=self.num_periods).tolist()
+        missing = list(self.unregistered_periods.values())
         return [
-            {
-                "period": i,
-                "label": self.labels[i],
-                "photos": totals[i],
-                "registered": int((self.periods == i).sum()),
-            }
-            for i in range(self.num_periods)
+            {"period": i, "label": label, "photos": n + missing.count(i), "registered": n}
+            for i, (label, n) in enumerate(zip(self.labels, placed, strict=True))
         ]

@@ -85,6 +85,9 @@ def test_every_photo_that_is_missing_has_a_reason(joint: tuple[Path, Registered]
     assert {registered.unregistered_periods[n] for n in reasons} == {1}
     log = json.loads((out / "registration_log.json").read_text())
     assert {u["image"] for u in log["unregistered"]} == set(reasons)
+    certificate = json.loads((out / "registration.json").read_text())
+    counted = [[(p["photos"], p["registered"]) for p in f["periods"]] for f in (log, certificate)]
+    assert counted[0] == counted[1]
     stages = [s["stage"] for s in log["stages"]]
     assert stages.index("features") < stages.index("matches") < stages.index("joint")
 

@@ -201,7 +201,7 @@ def _check_together(options: Options, scene: Path | None) -> None:
     """
     for names, applies, condition in (
         (("route", "calibration"), scene is not None, "with --into"),
-        (("calibration",), options.cameras is not None, "with --cameras"),
+        (("calibration", "camera_model"), options.cameras is not None, "with --cameras"),
         (("max_image_size", "max_features"), options.features is not None, "with --features"),
         (("tie_scale",), options.tie_points is None, "without --tie-points"),
     ):
@@ -212,10 +212,10 @@ def _check_together(options: Options, scene: Path | None) -> None:
 def summary(registered: Registered, out: Path, crs: str | None) -> str:
     """The result in a few lines."""
     lines = [f"{out}: route {registered.route}, unit {registered.unit}"]
-    for i, label in enumerate(registered.labels):
-        placed = int((registered.periods == i).sum())
-        lost = sum(period == i for period in registered.unregistered_periods.values())
-        lines.append(f"  period {i} ({label}): {placed} of {placed + lost} photos registered")
+    for count in registered.counts():
+        placed, photos = count["registered"], count["photos"]
+        name = f"period {count['period']} ({count['label']})"
+        lines.append(f"  {name}: {placed} of {photos} photos registered")
     for name, reason in sorted(registered.unregistered.items())[:10]:
         lines.append(f"  {name}: {reason}")
     if len(registered.unregistered) > 10:

@@ -48,7 +48,7 @@ def estimate(inputs: PhotoInputs, matched: Matched, context: Context) -> Registe
     if inputs.scene is not None:
         remarks = same_positions(registered, inputs.scene.num_periods)
         context.stages.remark("route", *remarks)
-    counts = registered.counts(inputs.totals())
+    counts = registered.counts()
     remarks = [f"period {c['label']}: {c['registered']} of {c['photos']} photos" for c in counts]
     context.stages.remark("result", f"route {registered.route}", *remarks)
     return registered

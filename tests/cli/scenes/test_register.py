@@ -37,9 +37,7 @@ def test_the_verdicts_decide_on_the_exit_status(
         return SimpleNamespace(
             route="joint",
             unit="metre",
-            labels=("a", "b"),
-            periods=np.array([0, 0, 1]),
-            unregistered_periods={"b/1.jpg": 1},
+            counts=lambda: [{"period": 1, "label": "b", "photos": 2, "registered": 1}],
             unregistered={"b/1.jpg": "no matches"},
             points=np.zeros((5, 3)),
             georeference=None,
@@ -211,6 +209,7 @@ def test_control_is_checked_before_any_work(
         ("--route", "separate", "--into", "with --into"),
         ("--calibration", "shared", "--into", "with --into"),
         ("--calibration", "per-period", "--cameras", "with --cameras"),
+        ("--camera-model", "OPENCV", "--cameras", "with --cameras"),
         ("--max-image-size", "800", "--features", "with --features"),
         ("--max-features", "900", "--features", "with --features"),
         ("--tie-scale", "0.5", None, "without --tie-points"),
