@@ -81,6 +81,8 @@ def command(
     write_text_atomic(page, text)
     for name, _, reason in read.refused:
         say(f"note: {name} is not on the page: {reason}")
+    for note in read.left_out:
+        say(f"note: {note}")
     clicks = [] if points is None else [c.image for p in points.points for c in p.clicks]
     if others := [image for image in clicks if image not in names]:
         say(
