@@ -287,7 +287,7 @@ def _role(path: Path, number: int, text: str) -> Role | None:
 
 def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | None:
     """Column of each field by name; None if the first line is data."""
-    if len(row) > 3 and _is_number(row[2]) and _is_number(row[3]):
+    if len(row) > 3 and all(_is_number(text) or not text for text in row[2:4]):
         return None
     order: dict[str, int] = {}
     others = {name.lower() for name in row if name not in ("X", "Y", "Z")}

@@ -86,6 +86,13 @@ def test_csv_with_and_without_a_header(tmp_path: Path) -> None:
         assert found.crs is None
 
 
+def test_a_point_without_a_click_may_come_first(tmp_path: Path) -> None:
+    found = read(tmp_path, "g0,,,,100,200,50\ng1,a.jpg,1,2,110,200,50\n").points
+    assert [(p.name, len(p.clicks), p.role) for p in found] == [
+        ("g0", 0, "control"), ("g1", 1, "control"),
+    ]  # fmt: skip
+
+
 def test_odm_list(tmp_path: Path) -> None:
     text = (
         "WGS84 UTM 32N\n"
