@@ -196,29 +196,40 @@ def write_model(folder: Path, frames: Sequence[Frame], points: Points) -> None:
     write_raw_model(folder, cameras, images, tracks)
 
 
-def copy_poses(source: Path, folder: Path) -> int:
-    """Copy the poses of images from one model to another, to the last bit.
+def copy_poses(source: Path, folder: Path, frames: Sequence[Frame]) -> bool:
+    """Copy the poses of frames from one model to another, to the last bit, if it has them.
 
     Reading a pose as a matrix and writing it as a quaternion may change its last bits.
 
     Args:
-        source: Folder of the other model.
+        source: Folder of the other model, if there is one. Its images file may lack the frames, or
+            have other poses: those of the frames may come from rigs, or from another file.
         folder: Binary model without rigs and frames, as `write_model` writes it.
+        frames: Frames of ``folder``, some or all.
 
     Returns:
-        Number of images that got a pose.
+        False if nothing was copied.
     """
     old, new = read_raw_model(source).images, read_raw_model(folder)
-    assert old is not None and new.cameras and new.images is not None and new.points is not None
-    row = {name: i for i, name in enumerate(old.names)}
-    found = np.array([row.get(name, -1) for name in new.images.names], np.int64)
-    known = found >= 0
+    row = {} if old is None else {name: i for i, name in enumerate(old.names)}
+    if old is None or not all(frame.name in row for frame in frames):
+        return False
+    rows = [row[frame.name] for frame in frames]
+    poses = np.stack([frame.cam_from_world for frame in frames])
+    for found, pose in (
+        (rotation_from_quaternion(old.quaternions[rows]), poses[:, :3, :3]),
+        (old.translations[rows], poses[:, :3, 3]),
+    ):
+        if not np.allclose(found, pose, rtol=1e-9, atol=1e-9):
+            return False
+    assert new.cameras and new.images is not None and new.points is not None
+    place = {name: i for i, name in enumerate(new.images.names)}
+    to = [place[frame.name] for frame in frames]
     quaternions, translations = new.images.quaternions.copy(), new.images.translations.copy()
-    quaternions[known] = old.quaternions[found[known]]
-    translations[known] = old.translations[found[known]]
+    quaternions[to], translations[to] = old.quaternions[rows], old.translations[rows]
     images = replace(new.images, quaternions=quaternions, translations=translations)
     write_raw_model(folder, new.cameras, images, new.points)
-    return int(known.sum())
+    return True
 
 
 def _checked_points(

@@ -12,6 +12,7 @@ from typing import Any
 
 from chronoscene.colmap.model import copy_poses
 from chronoscene.errors import ConfigError, SceneError
+from chronoscene.formats import chronoscene as our_format
 from chronoscene.geodesy import ReferenceSystem, read_projected
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import write_text_atomic
@@ -160,8 +161,9 @@ def _stage_scene(registered: Registered, inputs: PhotoInputs, name: str, context
         f"{done.observations_lost} observations lost, {done.points_lost} points lost"
     ]
     if old is not None:
-        kept = copy_poses(old.root / "sparse/0", staged / "sparse/0")
-        remarks.append(f"poses of {kept} images copied unchanged")
+        model = our_format.MODEL  # a scene in another format may lack it, or have other poses there
+        if copy_poses(old.root / model, staged / model, old.frames):
+            remarks.append(f"poses of {len(old.frames)} images copied unchanged")
     context.stages.remark("scene", *remarks)
     return staged
 

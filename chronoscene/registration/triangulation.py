@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.colmap.model import copy_poses, read_model, read_raw_model
+from chronoscene.colmap.model import copy_poses, read_model
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.decoding import image_size
@@ -28,7 +28,6 @@ from chronoscene.registration.photos.inputs import place_photo
 from chronoscene.registration.reconstruct.estimation import without_twins
 from chronoscene.registration.work_folder import Stages, work_folder
 from chronoscene.scene import Points, Scene
-from chronoscene.scene.geometry import rotation_from_quaternion
 
 MIN_POINTS = 50
 """With fewer points, poses and photos hardly belong together."""
@@ -172,23 +171,6 @@ def _error(scene: Scene, expected: str, found: str, todo: str) -> RegistrationEr
     return RegistrationError(scene.root, expected=expected, found=found, todo=todo)
 
 
-def _has_poses(model: Path, scene: Scene) -> bool:
-    """Return True if the images file of a model has the poses of a scene: rigs may say others."""
-    images = read_raw_model(model).images
-    row = {} if images is None else {name: i for i, name in enumerate(images.names)}
-    if images is None or not all(frame.name in row for frame in scene.frames):
-        return False
-    rows = [row[frame.name] for frame in scene.frames]
-    poses = scene.frame_poses
-    return all(
-        np.allclose(a, b, rtol=1e-9, atol=1e-9)
-        for a, b in (
-            (rotation_from_quaternion(images.quaternions[rows]), poses[:, :3, :3]),
-            (images.translations[rows], poses[:, :3, 3]),
-        )
-    )
-
-
 def _write(
     scene: Scene, out: Path, image_source: ImageSource, model: Path | None, report: Report | None
 ) -> None:
@@ -198,6 +180,6 @@ def _write(
     progress = None if report is None else partial(report, "images")
     with staged_folder(out) as staged:
         our_format.write_texts(scene, staged)
-        if model is not None and _has_poses(model, scene):
-            copy_poses(model, staged / our_format.MODEL)
+        if model is not None:
+            copy_poses(model, staged / our_format.MODEL, scene.frames)
         place_images(scene, staged / "images", image_source=image_source, progress=progress)

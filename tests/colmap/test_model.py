@@ -320,7 +320,12 @@ def test_poses_are_copied_to_the_last_bit(make_scene_folder, tmp_path, form):
     ]
     write_model(tmp_path, turned, scene.points)
     before = read_raw_model(tmp_path)
-    assert copy_poses(source, tmp_path) == len(scene.frames)
+    assert not copy_poses(tmp_path / "none", tmp_path, scene.frames)
+    assert not copy_poses(source, tmp_path, turned)  # it has other poses
+    assert read_raw_model(tmp_path).images.translations.tobytes() == (
+        before.images.translations.tobytes()
+    )
+    assert copy_poses(source, tmp_path, scene.frames)
     old, new = read_raw_model(source).images, read_raw_model(tmp_path)
     row = [old.names.index(name) for name in new.images.names]
     assert new.images.quaternions.tobytes() == old.quaternions[row].tobytes()
