@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.colmap.model import Model, PosedImage, read_model
+from chronoscene.errors import SceneError
 from chronoscene.images.decoding import load_photo
 from chronoscene.images.store import resize_camera
 from chronoscene.io.pages import data_uri, render_page
@@ -51,15 +52,25 @@ def marking_page(
         max_size: Pixels of the longer side of an embedded photo.
         title: Of the page.
         report: Called with the progress.
+
+    Raises:
+        SceneError: If the model is damaged, or has none of the photos.
     """
     found = None if model is None else read_model(model)
     posed = {} if found is None else {image.name: image for image in found.images}
     names = [c.name for c in captures]
+    images = [posed.get(name) or posed.get(f"{name}.png") for name in plain_names(names)]
+    if model is not None and not any(images):
+        raise SceneError(
+            model,
+            expected=f"images such as {names[0]}",
+            found=min(posed, default="none"),
+            todo="give a model of these photos, such as OUT.work/model-joint of register",
+        )
     photos = []
-    for i, (capture, name) in enumerate(zip(captures, plain_names(names), strict=True)):
+    for i, (capture, image) in enumerate(zip(captures, images, strict=True)):
         if report is not None:
             report("photos", i, len(captures))
-        image = posed.get(name) or posed.get(f"{name}.png")
         photos.append(_photo(capture, image, max_size))
     state = {"points": [] if points is None else _points(points)}
     data = {

@@ -38,7 +38,7 @@ COLUMNS = {
     "sigma z": ("sz", "sigma_z", "accuracy_z"),
 }
 """Names of columns, in lower case; upper-case X, Y, Z are world coordinates, unless no other
-column can be the pixels."""
+column can be the pixels. So are E, N, h, as in the tables that `coordinates` writes."""
 
 _TODO_CSV = "write lines such as: corner1,2016/IMG_0001.jpg,812.5,334.0"
 _TODO_SEPARATORS = "separate the fields by commas, and write decimals with a point"
@@ -292,9 +292,10 @@ def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | Non
     order: dict[str, int] = {}
     others = {name.lower() for name in row if name not in ("X", "Y", "Z")}
     has_pixels = not others.isdisjoint((*COLUMNS["x"], *COLUMNS["y"]))
+    world = dict(zip("ENhXYZ", 2 * ("world x", "world y", "world z"), strict=True))
     for i, name in enumerate(row):
-        if name in ("X", "Y", "Z") and has_pixels:
-            order[f"world {name.lower()}"] = i
+        if name in world and (has_pixels or name not in "XYZ"):
+            order[world[name]] = i
             continue
         for key, names in COLUMNS.items():
             if name.lower() not in names:

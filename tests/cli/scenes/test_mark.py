@@ -43,3 +43,12 @@ def test_photos_and_clicks_that_the_page_does_not_show_are_named(
     assert "note: 1 photo in formats that are not read (.heic), such as 3.heic" in done.stderr
     assert "note: 1 click in photos that are not in CAPTURES, such as '9.jpg'" in done.stderr
     assert "page.html: 2 photos" in done.stdout
+
+
+def test_a_model_of_other_photos_is_refused(tmp_path: Path, captures: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 640 480 500 320 240\n", "utf-8")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 other/0.jpg\n\n", "utf-8")
+    (tmp_path / "points3D.txt").touch()
+    done = run_command("mark", captures, tmp_path / "page.html", "--model", tmp_path)
+    assert "expected images such as 0.jpg, found other/0.jpg" in done.stderr
+    assert not (tmp_path / "page.html").exists()

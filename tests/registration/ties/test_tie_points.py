@@ -172,7 +172,7 @@ def test_empty_fields_at_the_end_of_a_line_do_not_count(tmp_path: Path) -> None:
 
 
 def test_usual_names_of_world_coordinates(tmp_path: Path) -> None:
-    for names in ("Easting,Northing,Elevation", "lon,lat,height", "east,north,up"):
+    for names in ("Easting,Northing,Elevation", "lon,lat,height", "east,north,up", "E,N,h"):
         (point,) = read(tmp_path, f"point,image,x,y,{names}\np,a.jpg,1,2,3,4,5\n").points
         assert point.world == (3.0, 4.0, 5.0)
 
