@@ -25,7 +25,7 @@ from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import PhotoInputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.extension import add_period
-from chronoscene.registration.report.coordinates import placed_model, write_coordinates
+from chronoscene.registration.report.coordinates import write_coordinates
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
 from chronoscene.registration.ties.tie_points import TiePoints, by_photo, read_tie_points
@@ -104,7 +104,8 @@ def run(
             found_model = estimate(inputs, matched, context)
             registered, ties = _tie(found_model, points, crs, inputs, context)
         registered = replace(registered, features=matched.made_by)
-        staged = _stage_scene(registered, inputs, out.resolve().name, context)
+        scene = _stage_scene(registered, inputs, out.resolve().name, context)
+        staged = scene.root
         if ties is not None and (ties.replaced or ties.controlled):
             points = None  # they are points of the model already
         found = inspect_registration(
@@ -117,7 +118,7 @@ def run(
         )
         for name, judged in (("alignment", found.verdict), ("absolute position", found.position)):
             context.stages.remark(name, f"{judged.level}: {judged.text}")
-        write_coordinates(staged, placed_model(registered), registered.georeference, crs)
+        write_coordinates(staged, scene, registered.georeference, crs)
         log = json.dumps(_log(registered, inputs, context), indent=1, ensure_ascii=False)
         write_text_atomic(staged / output.LOG, log + "\n")
         output.check_free(out, overwrite=options.overwrite)
@@ -146,8 +147,8 @@ def _tie(
     return result.model, result
 
 
-def _stage_scene(registered: Registered, inputs: PhotoInputs, name: str, context: Context) -> Path:
-    """Write the scene into the work folder."""
+def _stage_scene(registered: Registered, inputs: PhotoInputs, name: str, context: Context) -> Scene:
+    """Write the scene into the work folder; return it."""
     staged = context.work / "scene"
     old = inputs.scene
     scene = output.as_scene(registered, name)
@@ -165,7 +166,7 @@ def _stage_scene(registered: Registered, inputs: PhotoInputs, name: str, context
         if copy_poses(old.root / model, staged / model, old.frames):
             remarks.append(f"poses of {len(old.frames)} images copied unchanged")
     context.stages.remark("scene", *remarks)
-    return staged
+    return done.scene
 
 
 def _log(registered: Registered, inputs: PhotoInputs, context: Context) -> dict[str, Any]:

@@ -16,11 +16,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene, writable_formats
 from chronoscene.geodesy import Georeference, from_crs, read_projected
 from chronoscene.io.staging import check_outside
-from chronoscene.registration.report.coordinates import (
-    coordinate_files,
-    placed_scene,
-    write_coordinates,
-)
+from chronoscene.registration.report.coordinates import coordinate_files, write_coordinates
 from chronoscene.scene import WorldFrame
 from chronoscene.scene.splits import split_hash
 
@@ -73,7 +69,7 @@ def command(
     # OUT may have other names of images and another split than SRC.
     scene = read_scene(out, format=target)
     if system is not None:
-        write_coordinates(out, placed_scene(scene), _local_frame(scene.world, out), system)
+        write_coordinates(out, scene, _local_frame(scene.world, out), system)
     lines = [f"{out}: {target} from {done.scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")

@@ -15,7 +15,7 @@ from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
 from chronoscene.registration.features.camera_groups import AUTO, FEW, MANY, MIN_PHOTOS
-from chronoscene.registration.output import Inspection
+from chronoscene.registration.output import LOG, Inspection
 from chronoscene.registration.photos.captures import photo_folders, read_captures
 from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import ROUTES, Registered
@@ -219,10 +219,8 @@ def summary(registered: Registered, out: Path, crs: str | None) -> str:
     for name, reason in sorted(registered.unregistered.items())[:10]:
         lines.append(f"  {name}: {reason}")
     if len(registered.unregistered) > 10:
-        lines.append(
-            f"  ... and {len(registered.unregistered) - 10} more; see registration_log.json"
-        )
-    lines.append(f"{len(registered.points)} points; decisions in {out / 'registration_log.json'}")
+        lines.append(f"  ... and {len(registered.unregistered) - 10} more; see {LOG}")
+    lines.append(f"{len(registered.points)} points triangulated; decisions in {out / LOG}")
     if crs is not None and registered.georeference is None:
         lines.append(f"no coordinates in {crs}: neither GPS nor ground control places the model")
     return "\n".join(lines) + "\n"

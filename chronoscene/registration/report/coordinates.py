@@ -1,4 +1,4 @@
-"""Cameras, points and control of a registration as tables, in a reference system.
+"""Cameras and points of a scene, and the control of a registration, in a reference system.
 
 The scene itself stays in its local frame: it is small enough for float32, and its shapes are not
 distorted by a map projection. Here every position is converted by itself, in float64.
@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chronoscene.arrays import Array
 from chronoscene.formats.shared.ply import write_vertices
@@ -23,9 +22,8 @@ from chronoscene.io.documents import read_json_document
 from chronoscene.io.laz import write_laz
 from chronoscene.io.staging import replacing, write_text_atomic
 from chronoscene.io.tables import csv_text
-from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import PointResidual
-from chronoscene.scene import Scene
+from chronoscene.scene import Points, Scene
 from chronoscene.scene.geometry import camera_centre
 
 GEOREFERENCE = "georeference.json"
@@ -36,36 +34,6 @@ CONTROL = "control.csv"
 
 DECIMALS = 4
 """Decimals of coordinates in metres: a tenth of a millimetre."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Placed:
-    """Images and points in a local frame."""
-
-    names: Sequence[str]
-    labels: Sequence[str]
-    """Period of each image."""
-    cam_from_world: Array
-    points: Array
-    colors: NDArray[np.uint8]
-
-
-def placed_scene(scene: Scene) -> Placed:
-    """Images and points of a scene; points that are not finite are nowhere."""
-    points = scene.points.select(scene.points.finite)
-    return Placed(
-        names=[f.name for f in scene.frames],
-        labels=[scene.periods[f.period].label for f in scene.frames],
-        cam_from_world=scene.frame_poses,
-        points=points.xyz,
-        colors=points.rgb,
-    )
-
-
-def placed_model(model: Registered) -> Placed:
-    """Images and points of a registration."""
-    labels = [model.labels[p] for p in model.periods]
-    return Placed(model.names, labels, model.cam_from_world, model.points, model.colors)
 
 
 def local_frame(scene: Scene) -> Georeference | None:
@@ -85,7 +53,7 @@ def local_frame(scene: Scene) -> Georeference | None:
 
 
 def write_coordinates(
-    folder: Path, model: Placed, frame: Georeference | None, output: ReferenceSystem | None
+    folder: Path, scene: Scene, frame: Georeference | None, output: ReferenceSystem | None
 ) -> None:
     """Write ``georeference.json`` and, in a reference system, tables of cameras and points.
 
@@ -93,17 +61,18 @@ def write_coordinates(
 
     Args:
         folder: An existing folder.
-        model: Images and points.
-        frame: Local frame of these; nothing is written if it is unknown.
+        scene: Points that are not finite are left out.
+        frame: Its local frame; nothing is written if it is unknown.
         output: Projected reference system.
     """
     if frame is None:
         return
     record = asdict(frame) | {"crs": frame.crs}
     if output is not None:
-        record["output"] = _linear(model, frame, output)
-        _write_cameras(folder / CAMERAS, model, frame, output)
-        _write_points(folder / POINTS, model, frame, output)
+        points = scene.points.select(scene.points.finite)
+        record["output"] = _linear(scene.frame_poses, points.xyz, frame, output)
+        _write_cameras(folder / CAMERAS, scene, frame, output)
+        _write_points(folder / POINTS, points, frame, output)
     write_text_atomic(folder / GEOREFERENCE, json.dumps(record, indent=1) + "\n")
 
 
@@ -113,17 +82,19 @@ def coordinate_files() -> tuple[str, ...]:
     return (GEOREFERENCE, CAMERAS, POINTS, *laz)
 
 
-def _linear(model: Placed, frame: Georeference, output: ReferenceSystem) -> dict[str, Any]:
+def _linear(
+    poses: Array, points: Array, frame: Georeference, output: ReferenceSystem
+) -> dict[str, Any]:
     """Linear approximation of the reference system around the middle of the cameras.
 
     Coordinates are ``offset + matrix @ world``, up to ``largest_error`` metres at any camera or
     point of the model.
     """
-    centres = camera_centre(model.cam_from_world)
+    centres = camera_centre(poses)
     middle = np.median(centres, axis=0)[None]
     matrix = output.derivative(frame, middle)[0]
     offset = (output.from_local(frame, middle) - middle @ matrix.T)[0]
-    places = np.concatenate([centres, model.points])
+    places = np.concatenate([centres, points])
     error = output.from_local(frame, places) - places @ matrix.T - offset
     return {
         "crs": output.text,
@@ -133,14 +104,14 @@ def _linear(model: Placed, frame: Georeference, output: ReferenceSystem) -> dict
     }
 
 
-def _write_cameras(path: Path, model: Placed, frame: Georeference, output: ReferenceSystem) -> None:
-    centres = camera_centre(model.cam_from_world)
+def _write_cameras(path: Path, scene: Scene, frame: Georeference, output: ReferenceSystem) -> None:
+    centres = camera_centre(scene.frame_poses)
     places = output.from_local(frame, centres)
     axes = output.derivative(frame, centres)
-    angles = omega_phi_kappa(model.cam_from_world[:, :3, :3], axes)
+    angles = omega_phi_kappa(scene.frame_poses[:, :3, :3], axes)
     rows = (
-        (name, label, *_metres(place), *(f"{a:.6f}" for a in angle))
-        for name, label, place, angle in zip(model.names, model.labels, places, angles, strict=True)
+        (f.name, scene.periods[f.period].label, *_metres(place), *(f"{a:.6f}" for a in angle))
+        for f, place, angle in zip(scene.frames, places, angles, strict=True)
     )
     head = ("image", "period", "E", "N", "h", "omega", "phi", "kappa")
     write_text_atomic(path, csv_text(head, rows))
@@ -166,14 +137,14 @@ def omega_phi_kappa(rotations: Array, axes: Array) -> Array:
     return np.asarray(Rotation.from_matrix(turned).as_euler("XYZ", degrees=True), np.float64)
 
 
-def _write_points(path: Path, model: Placed, frame: Georeference, output: ReferenceSystem) -> None:
+def _write_points(path: Path, points: Points, frame: Georeference, output: ReferenceSystem) -> None:
     """Write coordinates of 64 bits: those of 32 bits are exact to half a metre only."""
-    places = output.from_local(frame, model.points)
+    places = output.from_local(frame, points.xyz)
     with replacing(path) as partial:
-        write_vertices(partial, places, model.colors, comments=(f"crs {output.text}",))
+        write_vertices(partial, places, points.rgb, comments=(f"crs {output.text}",))
     if find_spec("laspy") is not None and len(places):
         with replacing(path.with_name(POINTS_LAZ)) as partial:
-            write_laz(partial, places, model.colors, output.text, step=0.1**DECIMALS)
+            write_laz(partial, places, points.rgb, output.text, step=0.1**DECIMALS)
 
 
 def write_control(path: Path, points: Sequence[PointResidual]) -> None:

@@ -17,13 +17,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.registration.generated import CaseSettings, Generated, generate_case
 from chronoscene.arrays import Array
 from chronoscene.geodesy import Georeference, read_reference_system
-from chronoscene.registration.output import Inspection, inspect_registration
+from chronoscene.registration.output import Inspection, as_scene, inspect_registration
 from chronoscene.registration.quality.position import Position, judge_position
-from chronoscene.registration.report.coordinates import (
-    omega_phi_kappa,
-    placed_model,
-    write_coordinates,
-)
+from chronoscene.registration.report.coordinates import omega_phi_kappa, write_coordinates
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment, align_with_tie_points
 from chronoscene.registration.ties.tie_points import read_tie_points
@@ -221,8 +217,8 @@ def test_cameras_and_points_come_in_the_reference_system(
     far: tuple[TieAlignment, float], made: Generated, tmp_path: Path
 ) -> None:
     ties, size = far
-    model = placed_model(ties.model)
-    write_coordinates(tmp_path, model, ties.model.georeference, UTM)
+    scene = as_scene(ties.model, "far")
+    write_coordinates(tmp_path, scene, ties.model.georeference, UTM)
     with (tmp_path / "cameras.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [r["image"] for r in rows] == list(made.model.names)
@@ -255,7 +251,7 @@ def test_cameras_and_points_come_in_the_reference_system(
     assert 0.01 < gap.max() < linear["largest_error"] + 1e-3
     # Of UTM in feet the error is the same in metres.
     feet = read_reference_system("", "+proj=utm +zone=32 +ellps=WGS84 +units=us-ft")
-    write_coordinates(tmp_path, model, ties.model.georeference, feet)
+    write_coordinates(tmp_path, scene, ties.model.georeference, feet)
     again = json.loads((tmp_path / "georeference.json").read_text())["output"]
     assert again["largest_error"] == pytest.approx(linear["largest_error"], rel=1e-3)
 
