@@ -396,7 +396,10 @@ def _names_of(image: str, names: Sequence[str]) -> list[str]:
     if found := _ending(plain, names):
         numbered = PurePosixPath(plain).with_stem(f"{PurePosixPath(plain).stem}_2")
         return found + (_ending(str(numbered), names) if plain != written else [])
-    return _ending(f"{plain}.png", names)
+    if found := _ending(f"{plain}.png", names):
+        return found
+    # For `mark`, photos have the names of before registration.
+    return [n for n in names if _ending(plain, [new := re.sub(r"\s", "_", n), f"{new}.png"])]
 
 
 def _ending(name: str, names: Sequence[str]) -> list[str]:

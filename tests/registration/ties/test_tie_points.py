@@ -198,6 +198,7 @@ def test_images_may_have_their_names_of_before_registration(tmp_path: Path) -> N
     before, after = ["2016/a b.jpg", "2016/c d.tif"], ["2016/a_b.jpg", "2016/c_d.tif.png"]
     for names in (before, after):
         assert images(points, names) == names
+    assert images(read(tmp_path, "p,2016/a_b.jpg,1,2\np,c_d.tif.png,1,2\n"), before) == before
 
 
 def test_a_name_with_blanks_that_may_be_either_of_two_photos(tmp_path: Path) -> None:
