@@ -44,16 +44,13 @@ SPEC = MethodSpec(
     },
 )
 
-_PERIOD_PRESETS = {name: {"appearance_dim": 32, **values} for name, values in _PRESETS.items()}
-_PERIOD_PRESETS["balanced"]["opacity_dropout"] = 0.2  # docs/experiments/generalisation.md
-
 PERIOD_SPEC = replace(
     SPEC,
     name="scaffold-gs-period",
     title="Scaffold-GS, period appearance",
     period_input="continuous",
     method="baselines.scaffold_gs.method:ScaffoldGSPeriod",
-    presets=_PERIOD_PRESETS,
+    presets={name: {"appearance_dim": 32, **values} for name, values in _PRESETS.items()},
     search={
         **SEARCH,
         "color_lr": Range(0.2, 5.0),
