@@ -64,22 +64,25 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Volumes:
-    """Volumes in cubic metres of a polygon, each with half of its 95 % interval."""
+    """Volumes in cubic metres of a polygon, each with half of its 95 % interval.
+
+    They are None if the periods have no known cell of it in common.
+    """
 
     polygon: str
     area_m2: float
     """Area of the cells that both periods know."""
     known_share: float
     """Share that this is of the polygon, of which a part may lie off the map."""
-    fill_m3: float
+    fill_m3: float | None
     """Volume of the cells that have risen significantly."""
-    fill_interval_m3: float
-    cut_m3: float
+    fill_interval_m3: float | None
+    cut_m3: float | None
     """Volume of the cells that have sunk significantly, positive."""
-    cut_interval_m3: float
-    net_m3: float
+    cut_interval_m3: float | None
+    net_m3: float | None
     """Balance of all cells: leaving out small differences would distort it."""
-    net_interval_m3: float
+    net_interval_m3: float | None
 
 
 def subtract(
@@ -112,6 +115,8 @@ def measure_volumes(
         on_map: Share of the polygon that is on the map.
     """
     known = inside & np.isfinite(difference.values)
+    if not known.any():
+        return Volumes(polygon, 0.0, 0.0, *(None,) * 6)
     changed, rises = known & difference.significant, difference.values > 0
     fill, cut, net = (
         _volume(difference, grid.resolution**2, cells)

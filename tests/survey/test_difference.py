@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from chronoscene.errors import SceneError
-from chronoscene.survey.difference import Difference, measure_volumes, subtract
+from chronoscene.survey.difference import Difference, Volumes, measure_volumes, subtract
 from chronoscene.survey.grid import Grid
 from chronoscene.survey.surface import Surface
 from chronoscene.survey.uncertainty import (
@@ -91,6 +91,8 @@ def test_level_of_detection_and_volumes(scene):
     inside[10:20, 10:30] = True
     box = measure_volumes(found, GRID, "box", inside)
     assert box.net_m3 == box.fill_m3 == pytest.approx(150, rel=0.01) and str(box.cut_m3) == "0.0"
+    unknown = measure_volumes(found, GRID, "unknown", np.isnan(second))
+    assert unknown == Volumes("unknown", 0.0, 0.0, None, None, None, None, None, None)
 
 
 def test_intervals_of_volumes_against_monte_carlo():

@@ -91,7 +91,9 @@ def _print(summary: Mapping[str, Any]) -> None:
         name = " → ".join(labels[period] for period in pair["periods"])
         for v in pair.get("volumes", ()):
             volumes = (
-                f"{v[f'{kind}_m3']:,.0f} ± {v[f'{kind}_interval_m3']:,.0f}"
+                "-"
+                if v[f"{kind}_m3"] is None
+                else f"{v[f'{kind}_m3']:,.0f} ± {v[f'{kind}_interval_m3']:,.0f}"
                 for kind in ("fill", "cut", "net")
             )
             rows.append((name, v["polygon"], f"{v['area_m2']:,.0f}", *volumes))
