@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.registration.generated import pose_errors
+from chronoscene.cli.scenes.register import summary
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.registration.context import Options
@@ -192,7 +193,9 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
     assert share < 0.02
     log = json.loads((out / "registration_log.json").read_text())
     remarks = [remark for stage in log["stages"] for remark in stage["remarks"]]
-    assert any(r.startswith("2023/copy_of_2016.jpg") and "the same photo" in r for r in remarks)
+    (again,) = (r for r in remarks if r.startswith("2023/copy_of_2016.jpg"))
+    assert again.endswith("are they the same photo?")
+    assert f"note: {again}\n" in summary(registered, out, None)
     assert not [f for f in validate_scene(out).findings if f.severity == "error"]
 
 

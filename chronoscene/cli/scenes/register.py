@@ -18,6 +18,7 @@ from chronoscene.registration.features.camera_groups import AUTO, FEW, MANY, MIN
 from chronoscene.registration.output import LOG, Inspection
 from chronoscene.registration.photos.captures import photo_folders, read_captures
 from chronoscene.registration.pipeline import run
+from chronoscene.registration.reconstruct.estimation import same_positions
 from chronoscene.registration.result import ROUTES, Registered
 
 DEFAULTS = Options()
@@ -221,6 +222,10 @@ def summary(registered: Registered, out: Path, crs: str | None) -> str:
     if len(registered.unregistered) > 10:
         lines.append(f"  ... and {len(registered.unregistered) - 10} more; see {LOG}")
     lines.append(f"{len(registered.points)} points triangulated; decisions in {out / LOG}")
+    if registered.route == "frozen" and (
+        again := same_positions(registered, registered.num_periods - 1)
+    ):
+        lines.append(f"note: {again[0]}" + (f" ({len(again)} like this)" if again[1:] else ""))
     if crs is not None and registered.georeference is None:
         lines.append(f"no coordinates in {crs}: neither GPS nor ground control places the model")
     return "\n".join(lines) + "\n"
