@@ -55,6 +55,7 @@ def _page_data(cloud: Cloud, rgb: NDArray[np.uint8]) -> dict[str, Any]:
         "unit": "m" if cloud.unit == "metre" else "",
         "half": (box.edges / 2).tolist(),
         "home": home_view(cloud, middle).tolist(),
+        "dates": len(cloud.labels),
         "periods": [
             {"label": label, "color": color, "points": points, "shown": part, "cameras": cameras}
             for label, color, (points, part, cameras) in periods

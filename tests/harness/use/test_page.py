@@ -288,7 +288,7 @@ def our_images(run, scene, frame):
 
 
 def test_in_a_browser(bench_here, tmp_path, browser):
-    outcome, _ = bench_here("chronogs", preset="fast", iterations=60)
+    outcome, _ = bench_here("chronogs", preset="fast", iterations=150)
     make_page(outcome.finished, tmp_path / "page")
     run = open_run(outcome.finished[0])
     scene = run.scene()

@@ -10,7 +10,8 @@ const floats = text => new Float32Array(bytes(text).buffer);
 const xyz = floats(data.xyz), rgb = bytes(data.rgb);
 const centres = floats(data.centres), directions = floats(data.directions);
 const canvas = get("view"), ctx = canvas.getContext("2d");
-const T = data.periods.length, number = new Intl.NumberFormat("en");
+// Points that no image sees are a group after the T dates.
+const T = data.dates, groups = data.periods.length, number = new Intl.NumberFormat("en");
 
 // A view is a rotation (rows right, up, towards the viewer), a place and pixels per unit.
 const VIEWS = {
@@ -20,7 +21,7 @@ const VIEWS = {
   home: data.home,
 };
 let R, at, zoom, named = "home", fitted = true, slow = 1;
-const on = new Array(T).fill(true);
+const on = new Array(groups).fill(true);
 
 const packed = (r, g, b) => (255 << 24 | b << 16 | g << 8 | r) >>> 0;
 const hex = c => [1, 3, 5].map(i => parseInt(c.slice(i, i + 2), 16));
@@ -63,7 +64,7 @@ function draw() {
   const dark = document.documentElement.classList.contains("dark");
   pixels.fill(dark ? packed(21, 22, 26) : packed(255, 255, 255));
   depth.fill(-Infinity);
-  for (let p = 0; p < T; p++) if (on[p]) drawPoints(p, moving ? slow : 1);
+  for (let p = 0; p < groups; p++) if (on[p]) drawPoints(p, moving ? slow : 1);
   ctx.putImageData(image, 0, 0);
   if (get("with-cameras").checked) drawCameras(dark);
   drawScale(dark);
@@ -218,7 +219,7 @@ const boxes = data.periods.map((period, p) => {
   const count = document.createElement("small");
   box.type = "checkbox"; box.checked = true;
   swatch.style.background = period.color;
-  name.textContent = !period.cameras ? period.label  // points that no image sees
+  name.textContent = p >= T ? period.label
     : period.label === String(p) ? `Period ${p}` : `${p}: ${period.label}`;
   name.title = `${name.textContent} (${number.format(period.cameras)} cameras)`;
   count.textContent = number.format(period.points);
