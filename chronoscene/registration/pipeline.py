@@ -94,7 +94,7 @@ def run(
         context = Context(work, Stages(work), options, report, lock)
         inputs = gather(captures, into, context)
         if points is not None:
-            points = by_photo(points, sorted(inputs.periods))
+            points = by_photo(points, inputs.sizes())
         matched = find_matches(inputs, context)
         ties: TieAlignment | None
         if options.route == "resection" and points is not None:

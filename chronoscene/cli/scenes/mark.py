@@ -74,7 +74,7 @@ def command(
         read = read_captures(captures, table=table)
         found, names = read.images, [c.name for c in read.images]
         if points is not None:
-            points = by_photo(points, names)
+            points = by_photo(points, {c.name: (c.width, c.height) for c in found})
         text = marking_page(
             found, points=points, model=model, max_size=max_size, title=page.stem, report=report
         )

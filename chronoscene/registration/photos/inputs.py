@@ -76,6 +76,11 @@ class PhotoInputs:
         periods = np.array(list(self.periods.values()), np.int64)
         return [int(n) for n in np.bincount(periods, minlength=len(self.labels))]
 
+    def sizes(self) -> dict[str, tuple[int, int] | None]:
+        """Width and height of every photo, by name; None for those that cannot be used."""
+        known = {c.name: (c.width, c.height) for c in self.images}
+        return {name: known.get(name) for name in sorted(self.periods)}
+
     def priors(self) -> dict[str, Any]:
         """Plausible positions: ``enu`` and ``sigma`` by name."""
         found = self.positions

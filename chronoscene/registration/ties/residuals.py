@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from chronoscene.arrays import Array
-from chronoscene.errors import SceneError
 from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, place, project, rays_at
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_points import Role, TiePoints
@@ -84,15 +83,6 @@ def clicks_of(model: Registered, tie_points: TiePoints) -> tuple[Clicks, list[st
             index = images.get(click.image)
             if index is None:
                 continue
-            camera = model.cameras[index]
-            if not (0 <= click.x <= camera.width and 0 <= click.y <= camera.height):
-                raise SceneError(
-                    f"{tie_points.path}:{click.line}",
-                    expected=f"a pixel of {click.image} ({camera.width} x {camera.height})",
-                    found=f"{click.x:g}, {click.y:g}",
-                    todo="correct the line; if it was clicked in photos of another size, give the "
-                    "ratio (--tie-scale)",
-                )
             track.append(number)
             image.append(index)
             xy.append((click.x, click.y))

@@ -189,10 +189,7 @@ def _assemble(path: Path, rows: Iterable[_Row], crs: ReferenceSystem | None) -> 
                 f"{row.sigma} after {sigmas[name]}", "correct one of them",
             )  # fmt: skip
         if click.image in mine:
-            raise _wrong(
-                path, click.line, f"one click of point {name!r} in {click.image}",
-                f"another one on line {mine[click.image].line}", "remove one of the two lines",
-            )  # fmt: skip
+            raise _second_click(path, name, click, mine[click.image].line)
         if click.image:
             mine[click.image] = click
         if world is not None and worlds.setdefault(name, world) != world:
@@ -346,7 +343,7 @@ def _projection(path: Path, line: str) -> ReferenceSystem:
     return read_reference_system(f"{path}:1", text)
 
 
-def by_photo(tie_points: TiePoints, names: Sequence[str]) -> TiePoints:
+def by_photo(tie_points: TiePoints, sizes: Mapping[str, tuple[int, int] | None]) -> TiePoints:
     """Give clicks the full names of their photos; a name that fits none stays.
 
     An image may be named by its whole path or by the end of it, where that is unique, and as it
@@ -354,11 +351,14 @@ def by_photo(tie_points: TiePoints, names: Sequence[str]) -> TiePoints:
 
     Args:
         tie_points: From `read_tie_points`.
-        names: All photos, because one that gets no pose may be the one that is meant.
+        sizes: Width and height of all photos by name, because one that gets no pose may be the one
+            that is meant; None for those that cannot be read.
 
     Raises:
-        SceneError: If a name fits several photos, or no click fits any at all.
+        SceneError: If a name fits several photos, no click fits any at all, one lies outside of its
+            photo, or a point has two in one photo.
     """
+    names = list(sizes)
     fits: dict[str, list[str]] = {}
     for click in (c for p in tie_points.points for c in p.clicks):
         if click.image not in fits:
@@ -376,10 +376,23 @@ def by_photo(tie_points: TiePoints, names: Sequence[str]) -> TiePoints:
             "correct the names",
         )  # fmt: skip
     full = {image: ends[0] for image, ends in fits.items() if ends}
-    points = (
-        replace(p, clicks=tuple(replace(c, image=full.get(c.image, c.image)) for c in p.clicks))
-        for p in tie_points.points
-    )
+    points = []
+    for point in tie_points.points:
+        clicks = [replace(c, image=full.get(c.image, c.image)) for c in point.clicks]
+        lines: dict[str, int] = {}
+        for click in clicks:
+            if lines.setdefault(click.image, click.line) != click.line:
+                raise _second_click(tie_points.path, point.name, click, lines[click.image])
+            size = sizes.get(click.image)
+            if size and not (0 <= click.x <= size[0] and 0 <= click.y <= size[1]):
+                raise _wrong(
+                    tie_points.path, click.line,
+                    f"a pixel of {click.image} ({size[0]} x {size[1]})",
+                    f"{click.x:g}, {click.y:g}",
+                    "correct the line; if it was clicked in photos of another size, give the "
+                    "ratio (--tie-scale)",
+                )  # fmt: skip
+        points.append(replace(point, clicks=tuple(clicks)))
     return replace(tie_points, points=tuple(points))
 
 
@@ -405,6 +418,13 @@ def _names_of(image: str, names: Sequence[str]) -> list[str]:
 def _ending(name: str, names: Sequence[str]) -> list[str]:
     """Return the name itself, if it is there, or those of which it is the end."""
     return [name] if name in names else [n for n in names if n.endswith(f"/{name}")]
+
+
+def _second_click(path: Path, point: str, click: Click, first: int) -> SceneError:
+    return _wrong(
+        path, click.line, f"one click of point {point!r} in {click.image}",
+        f"another one on line {first}", "remove one of the two lines",
+    )  # fmt: skip
 
 
 def _number(path: Path, line: int, text: str, what: str) -> float:

@@ -9,13 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.registration.generated import (
-    CAMERA,
-    CaseSettings,
-    Generated,
-    generate_case,
-    pose_errors,
-)
+from benchmarks.registration.generated import CaseSettings, Generated, generate_case, pose_errors
 from chronoscene.errors import SceneError
 from chronoscene.registration.photos.inputs import plain_names
 from chronoscene.registration.quality.certificate import certify
@@ -189,8 +183,13 @@ def test_world_coordinates_beside_every_name_of_pixels(tmp_path: Path, header: s
     assert read(tmp_path, "Point,Image,X,Y\np,a.jpg,1,2\n").points[0].clicks[0].y == 2.0
 
 
+def unread(names: Sequence[str]) -> dict[str, None]:
+    """Photos of unknown sizes."""
+    return dict.fromkeys(names)
+
+
 def images(points: TiePoints, names: Sequence[str]) -> list[str]:
-    return [c.image for p in by_photo(points, names).points for c in p.clicks]
+    return [c.image for p in by_photo(points, unread(names)).points for c in p.clicks]
 
 
 def test_images_may_have_their_names_of_before_registration(tmp_path: Path) -> None:
@@ -205,7 +204,7 @@ def test_a_name_with_blanks_that_may_be_either_of_two_photos(tmp_path: Path) -> 
     names = plain_names(["a_b.jpg", "a b.jpg"])
     points = read(tmp_path, "p,a b.jpg,1,2\n")
     with pytest.raises(SceneError, match=r"'a b.jpg', which fits a_b.jpg and a_b_2.jpg; .* scene"):
-        by_photo(points, names)
+        by_photo(points, unread(names))
     assert images(read(tmp_path, "p,a_b.jpg,1,2\np,a_b_2.jpg,1,2\n"), names) == names
 
 
@@ -214,9 +213,9 @@ def test_images_are_found_by_the_end_of_their_path(tmp_path: Path) -> None:
     points = read(tmp_path, "p,a.jpg,1,2\np,2018/b c.jpg,1,2\np,zz.jpg,1,2\n")
     assert images(points, names) == ["2016/a.jpg", "2018/b_c.jpg", "zz.jpg"]
     with pytest.raises(SceneError, match=r"ties.csv:1: .*2016/b_c.jpg and 2018/b_c.jpg"):
-        by_photo(read(tmp_path, "p,b_c.jpg,1,2\n"), names)
+        by_photo(read(tmp_path, "p,b_c.jpg,1,2\n"), unread(names))
     with pytest.raises(SceneError, match=r"names of photos, such as 2016/a.jpg, found other.jpg"):
-        by_photo(read(tmp_path, "p,other.jpg,1,2\n"), names)
+        by_photo(read(tmp_path, "p,other.jpg,1,2\n"), unread(names))
 
 
 def test_a_failed_alignment_is_replaced(tmp_path: Path, apart: Generated) -> None:
@@ -328,11 +327,18 @@ def test_control_in_utm_goes_through_the_georeference(tmp_path: Path) -> None:
     assert not ties.located(None)
 
 
-def test_clicks_outside_the_photo(tmp_path: Path, apart: Generated) -> None:
-    name = apart.model.names[0]
-    with pytest.raises(SceneError, match=r"ties.csv:1: expected a pixel of .*found 4800, 20"):
-        align_with_tie_points(apart.model, read(tmp_path, f"p,{name},4800,20\n"))
-    assert CAMERA.width == 480
+def test_clicks_outside_the_photo(tmp_path: Path) -> None:
+    sizes = {"2016/a.jpg": (480, 360), "2016/b.jpg": None}
+    points = read(tmp_path, "p,a.jpg,480,360\np,b.jpg,4800,20\n")
+    assert by_photo(points, sizes).images == set(sizes)
+    with pytest.raises(SceneError, match=r"ties.csv:2: expected a pixel of 2016/a.jpg \(480 x 360"):
+        by_photo(read(tmp_path, "p,b.jpg,1,2\np,a.jpg,4800,20\n"), sizes)
+
+
+def test_two_clicks_in_one_photo(tmp_path: Path) -> None:
+    points = read(tmp_path, "p,a.jpg,1,2\np,2016/a.jpg,1,2\n")
+    with pytest.raises(SceneError, match=r"ties.csv:2: expected one click of point 'p'.* line 1"):
+        by_photo(points, unread(["2016/a.jpg"]))
 
 
 def test_tie_points_become_points_of_the_model(tmp_path: Path) -> None:

@@ -64,7 +64,13 @@ class HlocFile:
 
     def matches(self, names: Iterable[str]) -> Iterator[tuple[str, str, np.ndarray]]:
         """Photos of each pair, and the matches between their keypoints. [M, 2]"""
-        flat = {name.replace("/", "-"): name for name in names}
+        flat: dict[str, str] = {}
+        for name in names:
+            if (other := flat.setdefault(name.replace("/", "-"), name)) != name:
+                raise wrong(
+                    str(self.path), "photos whose names differ where hloc writes - for /",
+                    f"{other} and {name}", "rename one of the photos",
+                )  # fmt: skip
         for group, keys in self.groups.items():
             if "matches0" not in keys or (pair := _pair(group, flat)) is None:
                 continue

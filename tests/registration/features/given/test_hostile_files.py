@@ -144,3 +144,13 @@ def test_the_package_is_named_that_is_missing(
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ChronoSceneError, match=r"pip install 'chronoscene\[hloc\]'"):
         HlocFile(tmp_path / "f.h5")
+
+
+def test_names_that_hloc_does_not_tell_apart(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file["a-b-c.jpg/d.jpg/matches0"] = [0, -1]
+    ((first, second, _),) = HlocFile(tmp_path / "m.h5").matches(["a/b-c.jpg", "d.jpg"])
+    assert (first, second) == ("a/b-c.jpg", "d.jpg")
+    with pytest.raises(ChronoSceneError, match=r"found a/b-c.jpg and a-b/c.jpg"):
+        list(HlocFile(tmp_path / "m.h5").matches(["a/b-c.jpg", "a-b/c.jpg", "d.jpg"]))
