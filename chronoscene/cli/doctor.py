@@ -28,6 +28,7 @@ CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
 EXTRAS = {
     "compress": "constriction",
     "flip": "flip_evaluator",
+    "heic": "pillow_heif",
     "hloc": "h5py",
     "ray": "ray",
     "survey": "rasterio",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -47,8 +48,25 @@ _DECODE_ERRORS = (
     Image.DecompressionBombError,
 )
 
+HEIF_SUFFIXES = (".heic", ".heif")
+HEIF_TODO = "pip install 'chronoscene[heic]', or convert them to JPEG"
+
 Photo = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 """Colours, and a mask of those that count; see `load_photo`. [H, W, 3], [H, W]"""
+
+
+@cache
+def reads_heif() -> bool:
+    """Let Pillow read HEIC and HEIF files from now on; False without the extra ``heic``.
+
+    These are decoded upright, and their orientation tag is then 1.
+    """
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
 
 
 def image_size(path: Path) -> tuple[int, int]:

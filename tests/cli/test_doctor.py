@@ -53,7 +53,7 @@ def test_bare_machine_trains_and_is_told_what_to_install(bare):
         "CUDA: not needed: methods are trained on the CPU",
         "gsplat: pip install 'chronoscene[cuda]', or use the CPU",
         "LPIPS weights: run chronoscene download lpips-weights",
-        "extras: pip install 'chronoscene[compress,flip,hloc,ray,survey,tune,view]'",
+        "extras: pip install 'chronoscene[compress,flip,heic,hloc,ray,survey,tune,view]'",
     ):
         assert f"\n{advice}" in result.stdout
 
@@ -77,7 +77,7 @@ def test_full_machine(bare, monkeypatch, set_gsplat):
     found = rows(run().stdout)
     assert found["CUDA"] == ["ok", "GPU 1, 80.0 GB, triton 1.5.3"]
     assert found["gsplat"] == ["ok", "gsplat 1.5.3"]
-    assert found["extras"] == ["ok", "compress, flip, hloc, ray, survey, tune, view"]
+    assert found["extras"] == ["ok", "compress, flip, heic, hloc, ray, survey, tune, view"]
     assert found["LPIPS weights"][1].endswith("vgg16-397923af.pth")
     monkeypatch.setattr(doctor.gpu, "has_triton", lambda: False)
     text = run().stdout

@@ -13,9 +13,12 @@ from dataclasses import dataclass
 from datetime import date, datetime, timedelta
 from pathlib import Path, PurePosixPath
 
+from PIL import features
+
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.formats.shared.json_values import is_iso_date
+from chronoscene.images.decoding import HEIF_SUFFIXES, HEIF_TODO, reads_heif
 from chronoscene.images.exif import read_exif, taken_at
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads
@@ -25,11 +28,12 @@ from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 PERIOD_GAP_DAYS = 14  # In one folder of photos, a gap of so many days begins a new period
 
-UNREAD = (
-    *(".heic", ".heif", ".avif", ".jxl", ".dng"),
+OTHERS = (
+    *(*HEIF_SUFFIXES, ".avif", ".jxl", ".dng"),
     *(".arw", ".cr2", ".cr3", ".nef", ".orf", ".raf", ".rw2"),
 )
-"""Extensions of photos that are left out, unless the same photo is there in another form."""
+"""Extensions of photos that are left out if the same photo is there in another form, or if they
+cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +126,11 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
         SceneError: If there are no photos, or the table is wrong.
     """
     path, table = find_captures(Path(path), table)
+    reads_heif()  # for dates, too
     if table is not None:
         return _assemble(path, _from_table(path, table))
-    photos, unread = photos_in(path), _unread(path)
+    photos = photos_in(path)
+    unread = _unread(path, photos)
     groups, left_out = _period_folders(path, photos)
     if groups:
         return _assemble(path, groups, left_out=[*left_out, *unread])
@@ -133,9 +139,23 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
 
 
 def photos_in(folder: Path) -> list[Path]:
-    """List image files below a folder, sorted, without hidden files and folders; links count."""
-    found = (p for p in _files_in(folder) if p.suffix.lower() in IMAGE_SUFFIXES)
-    return sorted(found, key=lambda p: p.relative_to(folder).as_posix())
+    """List image files below a folder, sorted, without hidden files and folders; links count.
+
+    Phones write HEIC, and AVIF is alike: these are listed if they can be read, and if the same
+    photo is not there in another form.
+    """
+    files = list(_files_in(folder))
+    photos = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES]
+    known = {p.with_suffix("") for p in photos}
+    others = [p for p in files if _is_read(p.suffix.lower()) and p.with_suffix("") not in known]
+    return sorted([*photos, *others], key=lambda p: p.relative_to(folder).as_posix())
+
+
+def _is_read(suffix: str) -> bool:
+    """Return True for a file of `OTHERS` that can be read."""
+    if suffix == ".avif":
+        return bool(features.check("avif"))
+    return suffix in HEIF_SUFFIXES and reads_heif()
 
 
 def _files_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
@@ -152,17 +172,19 @@ def _files_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
             yield path
 
 
-def _unread(root: Path) -> list[str]:
+def _unread(root: Path, photos: Sequence[Path]) -> list[str]:
     """Name photos in formats that are not read; nothing if there are none."""
-    files = sorted(_files_in(root))
-    known = {p.with_suffix("") for p in files if p.suffix.lower() in IMAGE_SUFFIXES}
-    found = [p for p in files if p.suffix.lower() in UNREAD and p.with_suffix("") not in known]
+    known = {p.with_suffix("") for p in photos}
+    files = (p for p in sorted(_files_in(root)) if p.with_suffix("") not in known)
+    found = [p for p in files if p.suffix.lower() in OTHERS]
     if not found:
         return []
-    kinds = ", ".join(sorted({p.suffix.lower() for p in found}))
+    suffixes = sorted({p.suffix.lower() for p in found})
+    with_package = not reads_heif() and not set(HEIF_SUFFIXES).isdisjoint(suffixes)
     return [
-        f"{counted(len(found), 'photo')} in formats that are not read ({kinds}), such as "
-        f"{found[0].relative_to(root)}; they are left out; convert them to JPEG"
+        f"{counted(len(found), 'photo')} in formats that are not read ({', '.join(suffixes)}), "
+        f"such as {found[0].relative_to(root)}; they are left out; "
+        + (HEIF_TODO if with_package else "convert them to JPEG")
     ]
 
 

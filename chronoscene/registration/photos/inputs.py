@@ -417,6 +417,8 @@ def renamed(captures: Sequence[Capture], names: Sequence[str]) -> tuple[Capture,
 def _is_plain(path: Path) -> bool:
     """Return True if COLMAP reads a file in colour, as it is stored."""
     with Image.open(path) as image:
+        if image.format in ("HEIF", "AVIF"):
+            return False
         plain = image.mode in _PLAIN_MODES and getattr(image, "n_frames", 1) == 1
         turned_tiff = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) != 1
     return plain and not turned_tiff

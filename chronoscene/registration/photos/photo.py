@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
+from chronoscene.images.decoding import HEIF_SUFFIXES, HEIF_TODO, reads_heif
 from chronoscene.images.exif import RTK_FIXED, RTK_FLOAT, ExifData, read_exif, taken_at
 from chronoscene.images.masks import find_masks
 from chronoscene.io.documents import plain_file
@@ -78,6 +79,8 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
     except FileNotFoundError:
         return "the file is missing"
     except Exception as error:  # Pillow raises almost anything for damaged files
+        if path.suffix.lower() in HEIF_SUFFIXES and not reads_heif():
+            return f"HEIC photos are not read; {HEIF_TODO}"
         return f"cannot be decoded: {str(error) or type(error).__name__}"
     if min(width, height) < MIN_SIDE:
         return f"{width} x {height} pixels: too small"

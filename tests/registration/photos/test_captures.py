@@ -3,11 +3,16 @@
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from chronoscene.errors import SceneError
+from chronoscene.images.decoding import load_rgb
+from chronoscene.registration.photos import captures as captures_module
+from chronoscene.registration.photos import photo as photo_module
 from chronoscene.registration.photos.captures import read_captures
+from chronoscene.registration.photos.inputs import place_photos
 
 
 def photo(path: Path, *, size: tuple[int, int] = (96, 72), taken: str | None = None) -> Path:
@@ -43,15 +48,53 @@ def test_folders_may_be_links(tmp_path: Path) -> None:
 
 def test_photos_in_formats_that_are_not_read_are_named(tmp_path: Path) -> None:
     (tmp_path / "2023").mkdir()
-    (tmp_path / "2023" / "b.HEIC").touch()
-    with pytest.raises(SceneError, match=r"found 1 photo in formats that are not read \(.heic\)"):
+    (tmp_path / "2023" / "b.DNG").touch()
+    with pytest.raises(SceneError, match=r"found 1 photo in formats that are not read \(.dng\)"):
         read_captures(tmp_path)
     (tmp_path / "2023" / "a.dng").touch()
     photo(tmp_path / "2023" / "a.jpg")
     for name in ("2023/c.jpg", "2016/c.jpg"):
         photo(tmp_path / name)
         (note,) = read_captures(tmp_path).notes
-        assert note.startswith("1 photo in formats") and "2023/b.HEIC" in note
+        assert note.startswith("1 photo in formats") and "2023/b.DNG" in note
+
+
+@pytest.mark.parametrize("suffix", ["HEIC", "avif"])
+def test_photos_of_phones(suffix: str, tmp_path: Path) -> None:
+    if suffix == "HEIC":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    elif not captures_module.features.check("avif"):
+        pytest.skip("this Pillow has no AVIF")
+    root = tmp_path / "captures"
+    for label, year in (("before", 2023), ("after", 2016)):
+        photo(root / label / f"a.{suffix}", taken=f"{year}:05:01 10:00:00")
+        photo(root / label / "b.jpg", taken=f"{year}:05:01 10:00:00")
+        photo(root / label / f"b.{suffix}")
+    found = read_captures(root)
+    assert [p.label for p in found.periods] == ["after", "before"] and not found.notes
+    names = [c.name for c in found.images]
+    assert names == [f"{p}/{n}" for p in ("after", "before") for n in (f"a.{suffix}", "b.jpg")]
+    placed, remarks = place_photos(found.images, tmp_path / "placed")
+    assert placed[0] == f"after/a.{suffix}.png" and placed[1] == "after/b.jpg"
+    assert remarks == ["2 files converted to PNG: they were not plain 8-bit RGB or grey"]
+    pixels = load_rgb(tmp_path / "placed" / placed[0])
+    np.testing.assert_array_equal(pixels, load_rgb(root / names[0]))
+
+
+def test_without_the_package_for_photos_of_phones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (captures_module, photo_module):
+        monkeypatch.setattr(module, "reads_heif", lambda: False)
+    photo(tmp_path / "2016" / "a.jpg")
+    photo(tmp_path / "2023" / "b.jpg")
+    (tmp_path / "2023" / "c.heic").write_bytes(b"x")
+    (note,) = read_captures(tmp_path).notes
+    assert note.endswith("left out; pip install 'chronoscene[heic]', or convert them to JPEG")
+    table = tmp_path / "periods.csv"
+    table.write_text("image,period\n2016/a.jpg,0\n2023/c.heic,1\n")
+    ((_, _, reason),) = read_captures(tmp_path, table=table).refused
+    assert "HEIC photos are not read; pip install" in reason
 
 
 def test_folders_without_dates_are_in_natural_order(tmp_path: Path) -> None:
