@@ -35,6 +35,8 @@ OTHERS = (
 """Extensions of photos that are left out if the same photo is there in another form, or if they
 cannot be read."""
 
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".mts")
+
 
 @dataclass(frozen=True, slots=True)
 class CapturePeriod:
@@ -297,6 +299,11 @@ def _assemble(
         left_out: What is said about photos without a period.
     """
     if not listed:
+        videos = [p for p in _files_in(root) if p.suffix.lower() in VIDEOS]
+        if videos and not left_out:
+            name = videos[0].relative_to(root)
+            todo = f"take frames from them, two a second: ffmpeg -i {name} -r 2 -q:v 2 %04d.jpg"
+            raise _nothing(root, f"{counted(len(videos), 'video')}, and no image files", todo)
         raise _nothing(root, left_out[0] if left_out else "no image files")
     order = _ordered_labels(listed)
     images, refused = [], []

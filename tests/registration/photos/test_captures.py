@@ -59,6 +59,14 @@ def test_photos_in_formats_that_are_not_read_are_named(tmp_path: Path) -> None:
         assert note.startswith("1 photo in formats") and "2023/b.DNG" in note
 
 
+def test_videos(tmp_path: Path) -> None:
+    for name in ("2016/walk.MOV", "2023/walk.mp4"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    with pytest.raises(SceneError, match=r"2 videos, and no image files; .*ffmpeg -i 20.*walk"):
+        read_captures(tmp_path)
+
+
 @pytest.mark.parametrize("suffix", ["HEIC", "avif"])
 def test_photos_of_phones(suffix: str, tmp_path: Path) -> None:
     if suffix == "HEIC":
