@@ -1,4 +1,4 @@
-"""Options of Scaffold-GS. The defaults are the official command line's."""
+"""Options of Scaffold-GS. The defaults are those of the released script for Mip-NeRF 360."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class ScaffoldGSConfig(AnchorConfig):
     statistics_from: Share = 500 / 30_000
     density_from: Share = 1_500 / 30_000
     appearance_dim: NonNegativeInt = 0
-    """Length of the appearance vectors that the colour MLP sees; 0, none, in all published scripts.
-    ``scaffold-gs`` has one per training image and renders with their mean,
-    ``scaffold-gs-period`` one per period."""
+    """Length of the appearance vectors that the colour MLP sees; 0: none. Released scripts have 32
+    for photos by tourists, else 0. ``scaffold-gs`` has one per training image and renders with
+    their mean, ``scaffold-gs-period`` one per period."""
     appearance_lr: tuple[float, float] = (0.05, 0.0005)
     """Learning rate of the appearance vectors."""
