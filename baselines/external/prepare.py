@@ -107,8 +107,11 @@ def four_d_gaussians(data: Path, output: Path, config: FourDGaussiansConfig) -> 
     _write_cloud(data / "points3D_downsample2.ply", scene.points.xyz, scene.points.rgb)
     base = Path(config.source, config.arguments).absolute()
     _read(base)
+    # Pictures of the training, which the options for own scenes ask for, take time and a font that
+    # is sought in the working folder.
     (output / "config.py").write_text(
-        f"_base_ = [{str(base)!r}]\nOptimizationParams = dict(iterations={config.iterations})\n",
+        f"_base_ = [{str(base)!r}]\nOptimizationParams = dict(iterations={config.iterations})\n"
+        "ModelParams = dict(render_process=False)\n",
         encoding="utf-8",
     )
     ratios = [f.camera.K[1, 1] / f.camera.K[0, 0] - 1 for f in scene.frames]

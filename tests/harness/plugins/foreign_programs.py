@@ -104,6 +104,8 @@ def four_d_train(words):
         exec(file.read(), config)
     assert os.path.isfile(config["_base_"][0])
     assert config["OptimizationParams"]["iterations"] == int(given["save_iterations"])
+    # Its pictures of the training are labelled in a font that it seeks in the working folder.
+    assert config["ModelParams"]["render_process"] is False
     with open(os.path.join(given["s"], "points3D_downsample2.ply"), "rb") as file:
         assert b"property float nx" in file.read(400)
     assert not os.path.exists(os.path.join(given["s"], "sparse")), "it would be read as COLMAP"
