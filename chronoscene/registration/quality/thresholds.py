@@ -33,8 +33,8 @@ class Threshold:
 
 
 CLICK = (
-    "click tie points on the spots that the page (--report) suggests, and run again with "
-    "--tie-points"
+    "mark points that both dates show with chronoscene mark (--report may suggest spots), and run "
+    "again with --tie-points"
 )
 LOOK = (
     "look at the comparisons on the page (--report); if flat ground that did not change jumps in "
@@ -59,7 +59,7 @@ THRESHOLDS: dict[str, Threshold] = {
         what="registered images of a period",
         unit="images", doubtful=5, fail=3, larger_is_better=True,
         why="fewer images cannot place points by themselves, so nothing can be checked",
-        todo="add photos of this period",
+        todo="add photos of the periods with so few",
     ),
     "rotation": Threshold(
         what="remaining rotation between two periods",

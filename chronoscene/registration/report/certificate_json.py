@@ -141,7 +141,7 @@ def _held_out_figures(held: HeldOut | str, unit: str) -> Iterator[Figure]:
     if not isinstance(held, HeldOut):
         yield Figure("held-out reprojection error", None, "px", "", absent=held)
         return
-    over = f"{held.observations:,} observations of {held.tracks} tracks"
+    over = f"{held.observations:,} observations of {held.tracks:,} tracks"
     yield Figure("held-out reprojection error, median", held.median, "px", over)
     yield Figure("held-out reprojection error, 90%", held.p90, "px", over)
     yield Figure("held-out reprojection error, median", held.distance, unit, over)
@@ -152,7 +152,7 @@ def _held_out_figures(held: HeldOut | str, unit: str) -> Iterator[Figure]:
         ("held-out observations that disagree and gather in images", held.disagreement.images),
     ):
         yield Figure(name, others * share, "%", over)
-    tracks = f"{held.gap_tracks} tracks"
+    tracks = f"{held.gap_tracks:,} tracks"
     missing = None if held.gap is not None else "no track is placed by both periods"
     yield Figure("gap between both periods' points", held.gap, unit, tracks, absent=missing)
     matches = f"{held.matches:,} matches"
@@ -166,7 +166,7 @@ def _misalignment_figures(
     if not isinstance(found, Misalignment):
         yield Figure(f"misalignment {name}", None, "", "", absent=found)
         return
-    over = f"{found.tracks} agreeing tracks"
+    over = f"{found.tracks:,} agreeing tracks"
     percent = 100 / certificate.extent
     yield _interval(f"rotation {name}", found.rotation, "degrees", over)
     yield _interval(f"displacement {name}", found.shift, unit, over)

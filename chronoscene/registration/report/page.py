@@ -5,6 +5,7 @@ Styles and pictures are embedded; it loads nothing. Names are escaped by the tem
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -151,9 +152,10 @@ def _flickers(model: Registered, certificate: Certificate, photos: Photos) -> li
 
 def _clicks(
     model: Registered, certificate: Certificate, verdict: Verdict, photos: Photos
-) -> list[tuple[str, list[list[tuple[str, str, float, float]]]]]:
-    """Suggest places to click, for each pair of periods that did not pass."""
+) -> list[tuple[str, list[tuple[str, list[tuple[str, str, float, float]]]]]]:
+    """Suggest points to click, each with its own name, for pairs that did not pass."""
     found = []
+    numbers = itertools.count(1)
     seen = certificate.evidence.seen
     for pair in certificate.pairs:
         if verdict.pairs.get((pair.a, pair.b)) == "pass":
@@ -164,7 +166,7 @@ def _clicks(
             listed = spots(model, seen, pair, 3 * CLICKS, gaps=False, twice=True)
             chosen += [s for s in listed if photos.is_textured(s)][: CLICKS - len(chosen)]
         if chosen:
-            clicks = [_click(model, certificate, pair, s) for s in chosen]
+            clicks = [(f"p{next(numbers)}", _click(model, certificate, pair, s)) for s in chosen]
             found.append((_names(certificate, pair), clicks))
     return found
 

@@ -254,6 +254,29 @@ def test_unsaved_work_is_kept(browser: Any, page: Path) -> None:
     opened.context.close()
 
 
+def test_a_page_without_points_starts_with_an_empty_one(
+    browser: Any, captures: Path, tmp_path: Path
+) -> None:
+    page = tmp_path / "page.html"
+    page.write_text(marking_page(read_captures(captures).images, max_size=200))
+    opened = Opened(browser, page, 800, 600)
+    status = opened.tab.locator("#status")
+    assert status.inner_text() == "1 point, 0 marks"
+    opened.open(page)
+    assert status.inner_text() == "1 point, 0 marks"
+    opened.mark((20, 30))
+    assert status.inner_text() == "1 point, 1 mark, not saved"
+    opened.open(page)
+    assert "marks of last time" in status.inner_text()
+    opened.tab.keyboard.press("u")
+    assert status.inner_text() == "1 point, 0 marks"
+    opened.tab.locator("#only").check()
+    opened.tab.keyboard.press("ArrowRight")
+    assert status.inner_text() == "No other photo is near this point."
+    assert opened.errors == []
+    opened.context.close()
+
+
 def test_a_mark_predicts_the_others(browser: Any, page: Path, truth: Scene) -> None:
     """On an epipolar line by one mark, at the place by two."""
     frames = {f.name: f for f in truth.frames}

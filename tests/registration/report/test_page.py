@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -214,28 +213,30 @@ def test_tie_points_are_listed(model: Registered, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "registration.json").read_text())["tie_points"]["points"]
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium on this machine")
-def test_page_fits_a_phone(page: str, tmp_path: Path) -> None:
-    """Nothing but tables in their own scroll boxes is wider than a narrow window."""
-    # A headless window is 500 pixels wide at least: the body is held to 360 instead.
-    probe = (
-        "<script>document.body.style.width = '360px';"
-        "document.documentElement.dataset.wide = document.body.scrollWidth</script>"
-    )
-    framed = page.replace("</body>", f"{probe}</body>")
-    (tmp_path / "page.html").write_text(framed)
-    result = subprocess.run(
-        [
-            "chromium", "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
-            "--no-first-run", "--disable-background-networking", "--disable-component-update",
-            "--disable-sync", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom",
-            "--window-size=360,800", f"file://{tmp_path / 'page.html'}",
-        ],
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    found = re.search(r'data-wide="(\d+)"', result.stdout)
-    assert found is not None, result.stderr[-500:]
-    assert int(found[1]) <= 360
+def test_page_fits_a_phone(browser: Any, page: str, tmp_path: Path) -> None:
+    """Only tables in scroll boxes of their own are wider than a narrow window, with whole words."""
+    (tmp_path / "page.html").write_text(page)
+    tab = browser.new_page(viewport={"width": 360, "height": 800})
+    errors: list[str] = []
+    tab.on("pageerror", lambda e: errors.append(str(e)))
+    tab.on("console", lambda m: errors.append(m.text))
+    tab.goto(f"file://{tmp_path / 'page.html'}")
+    assert tab.evaluate("document.body.scrollWidth") <= 360
+    name = tab.get_by_role("cell", name="held-out reprojection error, median").first
+    assert name.bounding_box()["width"] > 80  # "reprojection" in one line
+    tab.get_by_label("Blink all").check()
+    assert tab.locator(".blink:checked").count() == tab.locator("figure").count()
+    assert errors == []
+    tab.close()
+
+
+def test_suggested_points_have_names_of_their_own(model: Registered) -> None:
+    """A name that two pairs of periods share would join their clicks to one point."""
+    certificate = certify(model)
+    twice = replace(certificate, pairs=certificate.pairs * 2)
+    page = render_report(model, twice, judge(certificate), judge_position(model))
+    points = re.findall(r"<td>(p\d+)</td>", page)
+    assert len(points) > 2 and points == [f"p{i + 1}" for i in range(len(points))]
 
 
 def test_rings_of_gps_are_drawn_in_the_frame_of_gps_only(model: Registered) -> None:

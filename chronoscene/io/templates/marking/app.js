@@ -1,9 +1,11 @@
 const $ = id => document.getElementById(id), view = $("view"), lens = $("lens");
 const photos = DATA.photos, KEY = `chronoscene-marks-${DATA.key}`, LENS = 5, NEAR = 4;
-const initial = JSON.stringify(DATA.state);
-let state = DATA.state, saved = initial, history = [], photo = 0, point = 0;
+let state = DATA.state, history = [], photo = 0, point = 0;
 let scale = 1, shift = [0, 0], cursor = null, images = new Map();
 // state.points: {name, role, world, sigma, marks: {photo name: [x, y]}}, pixels of the original.
+if (!state.points.length) addPoint();
+const initial = JSON.stringify(state);
+let saved = initial;
 
 const kept = (() => { try { return localStorage.getItem(KEY); } catch { return null; } })();
 if (kept && kept !== initial) {
@@ -11,10 +13,10 @@ if (kept && kept !== initial) {
   say("The marks of last time are back; Undo goes back to the file.");
   history.push(initial);
 }
-if (!state.points.length) addPoint();
 addEventListener("beforeunload", e => { if (JSON.stringify(state) !== saved) e.preventDefault(); });
 
 function say(text) { $("status").textContent = text; }
+function counted(n, word) { return `${n} ${word}${n === 1 ? "" : "s"}`; }
 function change(action) {
   history.push(JSON.stringify(state));
   action();
@@ -26,7 +28,7 @@ function keep() {
     if (text === initial) localStorage.removeItem(KEY); else localStorage.setItem(KEY, text);
   } catch { /* private mode: the warning remains */ }
   const marks = state.points.reduce((n, p) => n + Object.keys(p.marks).length, 0);
-  say(`${state.points.length} points, ${marks} marks${text === saved ? "" : ", not saved"}`);
+  say(`${counted(state.points.length, "point")}, ${counted(marks, "mark")}${text === saved ? "" : ", not saved"}`);
   show();
 }
 function undo() {
@@ -73,6 +75,7 @@ function step(by) {
   const from = photo;
   do photo = (photo + by + photos.length) % photos.length;
   while (photo !== from && $("only").checked && !isNear(photos[photo]));
+  if (photo === from) say("No other photo is near this point.");
   fit();
   show();
 }
@@ -224,8 +227,8 @@ function show() {
   $("photo-name").textContent = `${now.name} (${photo + 1} of ${photos.length})`;
   $("points").replaceChildren(...state.points.map((p, i) => {
     const item = document.createElement("li"), button = document.createElement("button");
-    const count = Object.keys(p.marks).length;
-    button.textContent = `${p.marks[now.name] ? "✓ " : ""}${p.name} · ${p.role} · ${count} photo${count === 1 ? "" : "s"}`;
+    const photosOfPoint = counted(Object.keys(p.marks).length, "photo");
+    button.textContent = `${p.marks[now.name] ? "✓ " : ""}${p.name} · ${p.role} · ${photosOfPoint}`;
     if (i === point) button.setAttribute("aria-current", "true");
     button.onclick = () => choose(i);
     item.append(button);
