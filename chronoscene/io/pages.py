@@ -8,6 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from chronoscene.io.wording import counted
+
 if TYPE_CHECKING:
     from jinja2 import Environment
     from PIL import Image
@@ -18,7 +20,8 @@ TEMPLATES = Path(__file__).parent / "templates"
 def render_page(name: str, **values: Any) -> str:
     """Fill in ``templates/<name>.html.j2``; all values are escaped.
 
-    In a template, ``{{ asset("shared/page.css") }}`` inserts a file of ``templates/`` unchanged.
+    In a template, ``{{ asset("shared/page.css") }}`` inserts a file of ``templates/`` unchanged,
+    and ``{{ n|counted("scene") }}`` counts a noun.
 
     Args:
         name: Template, such as ``viewer/page``.
@@ -37,6 +40,7 @@ def _environment() -> Environment:
         loader=FileSystemLoader(TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     # The last line end goes: the template has one after the call.
+    environment.filters["counted"] = counted
     environment.globals["asset"] = lambda file: Markup(
         (TEMPLATES / file).read_text(encoding="utf-8").removesuffix("\n")
     )

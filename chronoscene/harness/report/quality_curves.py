@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from textwrap import fill
 from typing import NamedTuple
 
 from markupsafe import Markup
@@ -13,7 +14,7 @@ from chronoscene.harness.files.records import RunRecord
 from chronoscene.harness.report.summary import name_of
 from chronoscene.harness.report.time_to_quality import read_curve
 
-SIZE = (6.4, 3.2)  # Width and height in inches
+SIZE = (4.6, 2.6)  # Width and height in inches
 STYLES = ("solid", "dashed", "dotted")
 """Line styles of matplotlib and of CSS, for the configurations of a method."""
 
@@ -44,7 +45,8 @@ def draw_curves(records: Sequence[RunRecord]) -> list[Curves]:
 
 def _draw(records: Sequence[RunRecord], device: str) -> Curves | None:
     figure = canvas.new_figure(*SIZE, layout="constrained")
-    axes = figure.add_subplot(xlabel=f"training [s] on {canvas.plain(device)}", ylabel="PSNR [dB]")
+    time = fill(f"training [s] on {canvas.plain(device)}", 48)
+    axes = figure.add_subplot(xlabel=time, ylabel="PSNR [dB]")
     canvas.quiet_axes(axes)
     axes.grid(axis="y", color=canvas.GRID, linewidth=0.6)
     methods = list(dict.fromkeys(record.method for record in records))

@@ -234,7 +234,8 @@ def _bar(scale: float, unit: str) -> tuple[float, str]:
     length = MAP_WIDTH / 5 / scale
     power = 10.0 ** np.floor(np.log10(length))
     round_length = power * max(f for f in (1, 2, 5) if f * power <= length)
-    return round(round_length * scale, 1), f"{round_length:g} {'m' if unit == 'metre' else 'units'}"
+    name = "m" if unit == "metre" else "unit" if round_length == 1 else "units"
+    return round(round_length * scale, 1), f"{round_length:g} {name}"
 
 
 def _pair(xy: Array) -> tuple[float, float]:

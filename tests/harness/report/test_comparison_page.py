@@ -117,6 +117,22 @@ addEventListener("load", () => {
 """
 
 
+OVERLAPS = """
+[...document.querySelectorAll(".plot text")].map(e => e.getBoundingClientRect())
+  .flatMap((a, i, all) => all.slice(i + 1).filter(b => a.left < b.right && b.left < a.right
+    && a.top < b.bottom && b.top < a.bottom))
+"""
+
+
+def test_labels_of_plots_do_not_overlap_on_a_phone(browser, make_page, tmp_path):
+    (tmp_path / "page.html").write_text(make_page())
+    tab = browser.new_page(viewport={"width": 390, "height": 844})
+    tab.goto(f"file://{tmp_path / 'page.html'}")
+    assert tab.locator(".plot text").count() > 8
+    assert tab.evaluate(OVERLAPS) == []
+    tab.close()
+
+
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium on this machine")
 @pytest.mark.parametrize(("scheme", "ground"), [(1, "rgb(246, 247, 248)"), (0, "rgb(20, 23, 26)")])
 def test_the_page_on_a_phone(make_page, tmp_path, scheme, ground):

@@ -96,7 +96,14 @@ def test_no_pictures_of_files_outside(scene, tmp_path):
 
 def test_errors_of_periods_are_shown(scene):
     page = Page(write_html([scene.validate()]))
-    assert re.search(r"error, px\s+09\s+6\s+3\s+0\.00", page.text)
+    assert re.search(r"median error, px\s+09\s+6\s+3\s+0\.00", page.text)
+
+
+def test_one_error_is_singular(scene):
+    scene.path("images/a003.png").unlink()
+    report = scene.validate()
+    assert "0 warnings" in (text := Page(write_html([report, report])).text)
+    assert text.count("1 error,") == 2 and "1 errors" not in text
 
 
 def test_strict_makes_a_scene_with_warnings_not_valid(scene):

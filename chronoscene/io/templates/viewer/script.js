@@ -127,7 +127,8 @@ function drawScale(dark) {
   ctx.lineWidth = 2 * ratio;
   ctx.beginPath(); ctx.moveTo(left, bottom); ctx.lineTo(left + length * zoom, bottom); ctx.stroke();
   ctx.font = `${12 * ratio}px system-ui, sans-serif`;
-  ctx.fillText(`${+length.toPrecision(1)} ${data.unit || "units"}`, left, bottom - 7 * ratio);
+  const unit = data.unit || (length === 1 ? "unit" : "units");
+  ctx.fillText(`${+length.toPrecision(1)} ${unit}`, left, bottom - 7 * ratio);
   const ox = left + 34 * ratio, oy = bottom - 60 * ratio, arm = 24 * ratio;
   ["x", "y", "z"].forEach((name, i) => {
     const dx = R[0][i] * arm, dy = -R[1][i] * arm;
