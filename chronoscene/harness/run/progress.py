@@ -25,6 +25,7 @@ class RunsDisplay:
         self._total, self._ended = total, 0
         self._log = log
         self._shares: dict[object, float] = {}
+        self._resumed: dict[object, float] = {}
         self._began = time.monotonic()
         self._lock = threading.Lock()
         console = console or Console(stderr=True)
@@ -71,6 +72,7 @@ class RunsDisplay:
             self.log(what)
             return
         self._shares[run] = done / total
+        self._resumed.setdefault(run, done / total)  # the first one: it took none of our time
         self._show()
 
     def _show(self, *, plain: bool = False) -> None:
@@ -84,8 +86,8 @@ class RunsDisplay:
     def status(self, done: float) -> str:
         """Describe the progress in one line; ``done`` counts shares of unfinished runs, too."""
         pieces = [f"{self._ended} of {self._total} runs", f"{len(self._shares)} under way"]
-        seconds = time.monotonic() - self._began
-        if done > KNOWN:
-            pieces.append(f"{3600 * done / max(seconds, 1e-9):,.1f} runs/h")
-            pieces.append(f"{format_time(seconds * (self._total - done) / done)} left")
+        seconds, ours = time.monotonic() - self._began, done - sum(self._resumed.values())
+        if ours > KNOWN:
+            pieces.append(f"{3600 * ours / max(seconds, 1e-9):,.1f} runs/h")
+            pieces.append(f"{format_time(seconds * (self._total - done) / ours)} left")
         return ", ".join(pieces)

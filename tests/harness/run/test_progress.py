@@ -6,6 +6,7 @@ import pytest
 from rich.console import Console
 
 from chronoscene.harness.plan.stop import StopRule
+from chronoscene.harness.run import progress
 from chronoscene.harness.run.progress import RunsDisplay
 from chronoscene.harness.train import progress as display_module
 from chronoscene.harness.train.progress import ProgressDisplay
@@ -81,6 +82,7 @@ def test_several_runs_have_one_bar(live):
     console = Console(file=buffer, force_terminal=live, width=100, color_system=None)
     display = RunsDisplay(4, said.append, console)
     with display, display.showing() as report, display.showing() as other:
+        report("iteration 1", 100, 1000)
         report("iteration 5", 500, 1000)
         other("b: a note [x]", 0, 0)
         display._bar.refresh()
@@ -95,3 +97,15 @@ def test_several_runs_have_one_bar(live):
             "1 of 4 runs, 1 under way,",
             "2 of 4 runs, 0 under way,",
         ]
+
+
+def test_what_was_trained_before_is_not_in_the_rate_of_several_runs(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    display = RunsDisplay(2, print, Console(file=io.StringIO()))
+    with display, display.showing() as report:
+        report("iteration 500", 500, 1000)
+        now[0] = 60.0
+        assert display.status(0.5) == "0 of 2 runs, 1 under way"
+        report("iteration 750", 750, 1000)
+        assert display.status(0.75).endswith("15.0 runs/h, 5:00 left")
