@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from glob import escape
 from pathlib import Path
 
 from chronoscene.errors import ConfigError
@@ -11,7 +12,7 @@ from chronoscene.harness.files.predictions import ImageWriter, Manifest, read_ma
 from chronoscene.harness.files.records import GROUND_TRUTH
 from chronoscene.images.decoding import load_photo
 from chronoscene.images.store import evaluation_size
-from chronoscene.io.staging import needing_space, partial_name
+from chronoscene.io.staging import needing_space, partial_name, remove_abandoned
 from chronoscene.scene import Scene
 
 
@@ -45,6 +46,7 @@ def freeze_ground_truth(runs: Path, scene: Scene, scene_hash: str, max_width: in
 
 
 def _write_ground_truth(folder: Path, scene: Scene, scene_hash: str, max_width: int) -> None:
+    remove_abandoned(folder.parent, escape(folder.name))
     partial = folder.with_name(partial_name(folder.name))
     try:
         with needing_space(folder):
