@@ -160,6 +160,8 @@ def test_validate_wants_one_scene(in_folder):
         ({"preset": "quick"}, "--preset"),
         ({"overrides": {"chronogs.size": 3}}, "--set"),
         ({"scenes": "nowhere"}, "nowhere: expected"),
+        ({"out": "data/plaza/runs"}, "--out data/plaza/runs: expected a place outside the scene"),
+        ({"out": "data"}, "--out .*data: expected a folder without the scene"),
     ],
 )
 def test_bench_refuses_before_it_trains(in_folder, wrong, message):

@@ -195,7 +195,7 @@ def settings_from(
         photo_disk=round(photo_disk * 1e9),
         **options,
     )
-    check_place("--out", out, outside=[scene.path for scene in settings.scenes])
+    check_place("--out", out)
     return settings
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 from chronoscene.errors import ConfigError
+from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.provenance import scene_hash, scene_stamp
 from chronoscene.harness.files.source import read_bench_scene
 from chronoscene.harness.plan.memory import PhotoNeeds, photo_needs
@@ -35,7 +37,7 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
 
     Raises:
         SceneError: If one cannot be read or trained on.
-        ConfigError: If two have the same name.
+        ConfigError: If two have the same name, or as `check_not_among_runs`.
     """
     scenes: dict[str, tuple[Scene, str | None]] = {}
     for found in settings.scenes:
@@ -50,6 +52,7 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
                 found=f"{scene.name!r}, the name of {scenes[scene.name][0].root} too",
                 todo="rename a folder, or run the scenes with different --out",
             )
+        check_not_among_runs(scene, settings.run.runs)
         check_scene(scene)
         check_points(scene)
         scenes[scene.name] = scene, found.period_by
@@ -58,3 +61,18 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
         needs = photo_needs(scene, settings.run)
         stamp = scene_stamp(scene)
         yield BenchScene(scene, period_by, scene_hash(scene), stamp, split_hash(scene), needs)
+
+
+def check_not_among_runs(scene: Scene, runs: Path) -> None:
+    """Refuse a folder of runs that has a scene where the runs of this scene go.
+
+    Raises:
+        ConfigError: If it has.
+    """
+    if (runs / safe_part(scene.name)).resolve() == scene.root.resolve():
+        raise ConfigError(
+            f"--out {runs}",
+            expected="a folder without the scene, whose runs get a folder of its name",
+            found=f"the one that {scene.root} is in",
+            todo="choose another place: nothing is written into a dataset",
+        )

@@ -17,6 +17,7 @@ from chronoscene.formats.shared.grouping import absolute_rule
 from chronoscene.harness.files.protocols import PROTOCOLS, check_protocol
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.images.store import MAX_WIDTH
+from chronoscene.io.staging import check_outside
 from chronoscene.methods import is_preset_file, preset_name
 from chronoscene.metrics.lpips_weights import check_available
 
@@ -178,13 +179,16 @@ def bench_settings(
 
     Raises:
         SceneError: If a folder has no scene.
-        ConfigError: If the format is unknown, or as `BenchSettings`.
+        ConfigError: If the format is unknown, the folder of runs is in a scene, or as
+            `BenchSettings`.
         MetricUnavailableError: If there are no weights of LPIPS at the place given.
     """
     if lpips_weights is not None:
         check_available(lpips_weights)
     rule = absolute_rule(period_by)
-    found = (find_scenes(folder, format=dataset_format, period_by=rule) for folder in scenes)
+    found = [find_scenes(folder, format=dataset_format, period_by=rule) for folder in scenes]
+    listed = tuple(chain.from_iterable(found))
+    check_outside(runs, [scene.path for scene in listed], option="--out")
     ours = {one.name for one in fields(BenchSettings)} & options.keys()
     run = RunSettings(
         runs.resolve(),
@@ -193,4 +197,4 @@ def bench_settings(
         **{k: value for k, value in options.items() if k not in ours},
     )
     shared = {name: options[name] for name in ours}
-    return BenchSettings(tuple(chain.from_iterable(found)), methods, run, **shared)
+    return BenchSettings(listed, methods, run, **shared)

@@ -25,6 +25,7 @@ from chronoscene.harness.files.provenance import (
     scene_hash,
 )
 from chronoscene.harness.plan.parts import check_scene
+from chronoscene.harness.plan.scenes import check_not_among_runs
 from chronoscene.harness.score.scoring import score_run
 from chronoscene.images.decoding import image_size, load_opaque
 from chronoscene.images.store import evaluation_size
@@ -169,10 +170,11 @@ def score_images(
 
     Raises:
         SceneError: If there are no test views.
-        ConfigError: If there is such a run, or the folder of runs has another scene of this name,
-            or other sizes.
+        ConfigError: If there is such a run, or the folder of runs has this scene itself, another
+            one of its name, or other sizes.
         ImageError: If images are missing, too many, or of another size.
     """
+    check_not_among_runs(scene, runs)
     check_scene(scene)
     tests, method = _test_views(scene), _method_name(name)
     out = runs / safe_part(scene.name) / f"{method}-{STRATEGY}-{PRESET}" / f"seed{seed}"

@@ -81,8 +81,13 @@ def test_runs_inside_a_scene_are_refused(make_scene_folder, tmp_path):
     scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
     (tmp_path / "link").symlink_to(scene)
     before = sorted(scene.rglob("*"))
-    for out in (scene / "runs", scene, tmp_path / "link" / "runs"):
-        with pytest.raises(ConfigError, match=r"^--out .*: expected a place outside the scene"):
+    for out, expected in (
+        (scene / "runs", "a place outside the scene"),
+        (scene, "a place outside the scene"),
+        (tmp_path / "link" / "runs", "a place outside the scene"),
+        (tmp_path, "a folder without the scene"),  # its runs would be in tmp_path / "place"
+    ):
+        with pytest.raises(ConfigError, match=f"^--out .*: expected {expected}"):
             bench_module.command.main(
                 [str(scene), "--method", "3dgs", "--out", str(out)], standalone_mode=False
             )

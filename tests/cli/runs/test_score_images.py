@@ -35,3 +35,5 @@ def test_nothing_is_written_into_the_scene(make_scene_folder, tmp_path):
     scene = make_scene_folder(IMAGES, tests=TESTS)
     with pytest.raises(ConfigError, match="expected a place outside the scene"):
         run(scene, tmp_path, "--name", "x", "--out", scene / "runs")
+    with pytest.raises(ConfigError, match="expected a folder without the scene"):
+        run(scene, tmp_path, "--name", "x", "--out", scene.parent)
