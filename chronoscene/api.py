@@ -254,7 +254,7 @@ def bench(
         threads: Threads per run; None for all cores.
         jobs: Number of runs at a time; None for one.
         photo_memory: Memory of a run for training photos in GB, including their decoding.
-        overwrite: Replace finished runs that were made with other settings.
+        overwrite: Replace finished runs and unfinished trainings that have other settings.
         format: Name of the dataset format of the scenes; None to detect it.
         period_by: Grouping of images into periods, for formats with a choice.
         log: Function that takes lines about the progress; None for silence.

@@ -127,7 +127,9 @@ MEMORY = click.option(
 @LPIPS_WEIGHTS
 @RUNS_OUT
 @click.option(
-    "--overwrite", is_flag=True, help="Replace finished runs that were made with other settings."
+    "--overwrite",
+    is_flag=True,
+    help="Replace finished runs, and discard unfinished trainings, that have other settings.",
 )
 @click.pass_context
 def command(

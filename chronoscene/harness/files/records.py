@@ -173,7 +173,7 @@ class RunRecord(BaseModel):
     max_width: int
     libraries: dict[str, str]
     started: str
-    """UTC, ISO 8601."""
+    """Start of the process that finished the run; UTC, ISO 8601."""
     notices: list[str]
     rows: Sequence[ViewScore] = Field(default=(), exclude=True)
     """Content of ``rows.csv``, if it was read; not part of ``run.json``."""

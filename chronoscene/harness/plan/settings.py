@@ -92,7 +92,7 @@ class BenchSettings:
     continue_to: int | None = None
     """Train finished runs further, up to this many iterations."""
     overwrite: bool = False
-    """True if finished runs with other settings may be replaced."""
+    """True if finished runs and unfinished trainings with other settings may be replaced."""
     jobs: int | None = None
     """Runs at a time; None for one, or as many as the cluster has room for."""
     job_memory: int | None = None
