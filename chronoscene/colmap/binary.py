@@ -5,10 +5,10 @@ at a time (seconds for a scene of half a million points), and it does not notice
 early. Every length is checked against the size of the file before it is used. Nothing else is
 checked, and nothing dropped: ids may be duplicated, names may not be valid text.
 
-Records are little endian; a count comes first (u64). Camera: i32 id, i32 model, u64 width, u64
-height, f64 parameters. Image: i32 id, f64 quaternion wxyz, f64 translation, i32 camera, name ended
+Records are little endian; a count comes first (u64). Camera: u32 id, i32 model, u64 width, u64
+height, f64 parameters. Image: u32 id, f64 quaternion wxyz, f64 translation, u32 camera, name ended
 by a zero byte, u64 n, then n times (f64 x, f64 y, i64 point id or -1). Point: u64 id, f64 xyz, u8
-rgb, f64 error, u64 n, then n times (i32 image id, i32 keypoint index). Rig: u32 id, u32 number
+rgb, f64 error, u64 n, then n times (u32 image id, i32 keypoint index). Rig: u32 id, u32 number
 of sensors, of the first its i32 type and u32 id, of each other one also u8 and, if that is set, a
 pose (7 f64). Frame: u32 id, u32 rig, 7 f64, u32 n, then n times (i32 sensor type, u32 sensor id,
 u64 image id).
@@ -41,15 +41,16 @@ from chronoscene.io.documents import plain_file
 from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES, Camera
 
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])  # A keypoint of an image
+OBSERVATION = np.dtype([("image", "<u4"), ("keypoint", "<i4")])  # An element of a track
 POINT_HEAD = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
 """Fields of a point before its track."""
 
 _COUNT = struct.Struct("<Q")
-_CAMERA_HEAD, _IMAGE_HEAD = struct.Struct("<iiQQ"), struct.Struct("<i7di")
+_CAMERA_HEAD, _IMAGE_HEAD = struct.Struct("<IiQQ"), struct.Struct("<I7dI")
 _LENGTH_AT = POINT_HEAD.itemsize - _COUNT.size
-_TRACK_BYTES = 8
+_TRACK_BYTES = OBSERVATION.itemsize
 _U32, _U32_PAIR, _FLAG = struct.Struct("<I"), struct.Struct("<II"), struct.Struct("<B")
 _SENSOR, _POSE = struct.Struct("<iI"), struct.Struct("<7d")
 
@@ -285,15 +286,15 @@ def _gather_points(data: bytes, offsets: Ints, lengths: Ints) -> RawPoints:
     # Observation j of point i begins start[i] pairs after the first one of the point.
     first = offsets + POINT_HEAD.itemsize - _TRACK_BYTES * start[:-1]
     at = np.repeat(first, lengths) + _TRACK_BYTES * np.arange(start[-1])
-    tracks = _at_every_byte(data, np.dtype("<i8"))[at].view("<i4").reshape(-1, 2)
+    tracks = _at_every_byte(data, np.dtype("<i8"))[at].view(OBSERVATION)
     return RawPoints(
         ids=ids.astype(np.int64),
         xyz=np.ascontiguousarray(heads["xyz"]),
         rgb=np.ascontiguousarray(heads["rgb"]),
         error=np.ascontiguousarray(heads["error"]),
         track_start=start,
-        track_image=tracks[:, 0].astype(np.int64),
-        track_keypoint=tracks[:, 1].astype(np.int64),
+        track_image=tracks["image"].astype(np.int64),
+        track_keypoint=tracks["keypoint"].astype(np.int64),
     )
 
 

@@ -14,15 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene.arrays import Array, Ints
-from chronoscene.colmap.binary import KEYPOINT, POINT_HEAD
+from chronoscene.colmap.binary import KEYPOINT, OBSERVATION, POINT_HEAD
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.scene.cameras import MODEL_NAMES, Camera
 from chronoscene.scene.geometry import quaternion_from_rotation
 
 _COUNT = struct.Struct("<Q")
 _CAMERA, _IMAGE = struct.Struct("<IIQQ"), struct.Struct("<I7dI")
-_PAIR = np.dtype("<i4")
-_ID = 0xFFFFFFFF  # Ids have 32 bits; readers differ in whether they are signed
 
 
 def write_raw_model(
@@ -99,7 +97,7 @@ def _cameras(cameras: Sequence[Camera]) -> bytes:
     parts = [_COUNT.pack(len(cameras))]
     for c in cameras:
         model = MODEL_NAMES.index(c.model)
-        parts.append(_CAMERA.pack(c.camera_id & _ID, model, c.width, c.height))
+        parts.append(_CAMERA.pack(c.camera_id, model, c.width, c.height))
         parts.append(struct.pack(f"<{len(c.params)}d", *c.params))
     return b"".join(parts)
 
@@ -111,8 +109,7 @@ def _images(images: RawImages) -> bytes:
     poses = np.concatenate([images.quaternions, images.translations], axis=1).tolist()
     for i, pose in enumerate(poses):
         begin, end = images.keypoint_start[i : i + 2].tolist()
-        ids = int(images.ids[i]) & _ID, int(images.camera_ids[i]) & _ID
-        parts.append(_IMAGE.pack(ids[0], *pose, ids[1]))
+        parts.append(_IMAGE.pack(int(images.ids[i]), *pose, int(images.camera_ids[i])))
         parts.append(images.names[i].encode("utf-8", "surrogateescape") + b"\0")
         parts.append(_COUNT.pack(end - begin))
         parts.append(keypoints[begin:end].tobytes())
@@ -125,12 +122,12 @@ def _points(points: RawPoints) -> bytes:
     heads = np.empty(len(points), POINT_HEAD)
     heads["id"], heads["xyz"], heads["rgb"] = points.ids, points.xyz, points.rgb
     heads["error"], heads["length"] = points.error, lengths
-    pairs = np.empty((len(points.track_image), 2), _PAIR)
-    pairs[:, 0], pairs[:, 1] = points.track_image, points.track_keypoint
+    tracks = np.empty(len(points.track_image), OBSERVATION)
+    tracks["image"], tracks["keypoint"] = points.track_image, points.track_keypoint
     head_sizes = np.full_like(lengths, POINT_HEAD.itemsize)
-    sizes = np.column_stack([head_sizes, lengths * 2 * _PAIR.itemsize]).ravel()
+    sizes = np.column_stack([head_sizes, lengths * OBSERVATION.itemsize]).ravel()
     data = np.empty(int(sizes.sum()), np.uint8)
     mask = np.repeat(np.tile([True, False], len(points)), sizes)
     data[mask] = heads.view(np.uint8).ravel()
-    data[~mask] = pairs.view(np.uint8).ravel()
+    data[~mask] = tracks.view(np.uint8).ravel()
     return _COUNT.pack(len(points)) + data.tobytes()

@@ -190,6 +190,27 @@ def test_records_written_by_hand(tmp_path):
     assert model.points.track_xy.tolist() == [[4.0, 4.0]]
 
 
+def test_ids_of_32_bits(tmp_path):
+    """COLMAP's ids of images and cameras are unsigned."""
+    image_id, camera_id = 2**32 - 2, 2**31
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        camera_id=camera_id, model="SIMPLE_PINHOLE", width=8, height=8, params=[8, 4, 4]
+    )
+    model.add_camera_with_trivial_rig(camera)
+    image = pycolmap.Image(name="a.png", camera_id=camera_id, image_id=image_id)
+    image.points2D = pycolmap.Point2DList([pycolmap.Point2D([4, 4])])
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    model.add_point3D([0, 0, 5], pycolmap.Track([pycolmap.TrackElement(image_id, 0)]), [1, 2, 3])
+    model.write_binary(str(tmp_path))
+    (posed,), points = (found := read_model(tmp_path)).images, found.points
+    assert (posed.image_id, posed.camera.camera_id) == (image_id, camera_id)
+    assert points.track_xy.tolist() == [[4, 4]]
+    raw = read_raw_model(tmp_path)
+    assert raw.images.ids.tolist() == raw.points.track_image.tolist() == [image_id]
+    assert raw.images.camera_ids.tolist() == [raw.cameras[0].camera_id] == [camera_id]
+
+
 def test_points_in_any_order_come_out_by_id(tmp_path):
     """COLMAP writes points in the order of a hash table; tracks must follow their points."""
     records(tmp_path, images=(1, 2), point_ids=())
