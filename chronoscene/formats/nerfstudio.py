@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.colmap.model import PosedImage
-from chronoscene.errors import ConfigError, SceneError
+from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import MAX_COORDINATE, MAX_PERIODS, check_name
 from chronoscene.formats.matrixcity import is_raw
 from chronoscene.formats.shared import grouping, transforms
@@ -224,12 +224,10 @@ def _group(file: _Document, names: list[str], by: str | None) -> grouping.Groupe
         times = {name: _time(f"{place}: {name}", frame) for name, frame in frames.items()}
         distinct = len(set(times.values()))
         if by == "time" and distinct > max(1, len(times) // 2):
-            raise ConfigError(
-                grouping.OPTION,
-                expected="times that the frames of a period share",
-                found=f"{distinct} times of {len(times)} frames in {place}",
-                todo="group them: --period-by count:N or gap:X",
-            )
+            expected = "times that the frames of a period share"
+            found = f"{distinct} times of {len(times)} frames"
+            todo = f"group them: {grouping.OPTION} count:N or gap:X"
+            raise json_error(place, expected, found, todo)
         return grouping.group_times(times, f"count:{distinct}" if by == "time" else by)
     raise grouping.rule_error(by, PERIOD_BY)
 

@@ -9,12 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from chronoscene.errors import ConfigError, SceneError
+from chronoscene.errors import SceneError
 from chronoscene.formats import nerfstudio, read_scene
 from chronoscene.formats.shared.transforms import CameraTable, opengl_from_pose, pose_from_opengl
 from chronoscene.scene import Camera, Period
 from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 from chronoscene.scene.similarity import Sim3
+from chronoscene.validation.run import validate_scene
 
 NAMES = [f"{i}.png" for i in range(4)]
 
@@ -116,8 +117,10 @@ def test_labels_tell_close_times_apart(nerfstudio_folder):
 def test_a_time_for_every_frame_needs_a_grouping(nerfstudio_folder):
     folder = nerfstudio_folder(NAMES, periods=False)
     edit_frames(folder, lambda i, frame: frame.update(time=[3.0, 2.0, 1.0, 0.0][i]))
-    with pytest.raises(ConfigError, match=r"found 4 times of 4 frames.*count:N or gap:X"):
+    with pytest.raises(SceneError, match=r"json.*found 4 times of 4 frames.*count:N or gap:X"):
         read_scene(folder)
+    report = validate_scene(folder)  # a scene among others must not end the command
+    assert [(f.code, f.place) for f in report.findings] == [("CS007", "transforms.json")]
     assert [f.period for f in read_scene(folder, period_by="count:2").frames] == [0, 1, 1, 1]
 
 
