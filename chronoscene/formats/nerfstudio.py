@@ -298,6 +298,13 @@ def write(
     """
     for frame in scene.frames:
         check_name(out, frame.name)
+        if "\\" in frame.name:
+            raise SceneError(
+                out,
+                expected="image names without backslashes, which are slashes in this format",
+                found=repr(frame.name),
+                todo="rename the image (chronoscene edit SCENE OUT --rename OLD=NEW)",
+            )
     finite = scene.points.finite
     if not finite.all():
         scene = replace(scene, points=scene.points.select(finite))

@@ -384,6 +384,14 @@ def test_written_time_runs_from_0_to_1(make_scene_folder, tmp_path):
     assert [frame["time"] for frame in frames] == [0, 0.5, 1, 0, 0.5, 1]
 
 
+def test_a_backslash_in_a_name_is_refused(make_scene_folder, tmp_path):
+    """Read again, it is a slash, and the frame would be left out as one without its image."""
+    scene = read_scene(make_scene_folder({"a\\b.png": 0, "c.png": 0}))
+    with pytest.raises(SceneError, match=r"without backslashes.*found 'a.*rename the image"):
+        nerfstudio.write(scene, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_written_points_project_to_where_they_were_seen(make_scene_folder, tmp_path):
     """By the documentation of the format alone: OpenGL camera-to-world, fl, c, PLY in its world."""
     scene = read_scene(make_scene_folder())
