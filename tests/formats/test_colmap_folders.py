@@ -193,7 +193,8 @@ def test_written_labels_are_read_again(make_scene_folder, tmp_path):
 
 
 def test_lines_of_a_table_are_counted_as_an_editor_does(tmp_path):
-    (tmp_path / "t.csv").write_text("\n\nperiod,file\n \n2016,a.png\n\n2017,b.png\n")
+    text = '\n\nperiod, file\n \n2016,a.png\n\n2017, "b.png"\n'
+    (tmp_path / "t.csv").write_text(text)
     rows = read_table(tmp_path / "t.csv")
     assert rows == [
         (f"{tmp_path}/t.csv:5", "a.png", "2016"),

@@ -121,7 +121,7 @@ def read_table(
     text = enumerate(read_text(path).splitlines(), start=1)
     lines = [(number, line) for number, line in text if line.strip()]
     try:
-        reader = csv.DictReader(line for _, line in lines)
+        reader = csv.DictReader((line for _, line in lines), skipinitialspace=True)
         rows = [(f"{path}:{lines[reader.line_num - 1][0]}", row) for row in reader]
     except csv.Error as error:
         raise _table_error(path, "a CSV file", str(error)) from error
