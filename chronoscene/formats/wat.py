@@ -10,7 +10,8 @@ its own need images undistorted to one camera.
 
 Nothing in these files marks them as WAT, so the names of its ten scenes are the mark. A scene
 of another name in the same layout is `colmap-folders`, which reads the same where the folders are
-in natural order.
+in natural order. Any project may be called ``street``: one with a list of test images, which WAT
+lacks, or with folders in its folders is `colmap-folders`, too.
 
 Source: Cai and Mueller, CLNeRF, ICCV 2023; layout as in ``IntelLabs/CLNeRF`` at ``d5573a7``.
 """
@@ -48,7 +49,11 @@ def matches(path: Path, model: FoundModel | None) -> bool:
     """Return True if a folder has the name of a scene of WAT, and its layout."""
     if model is None or path.resolve().name.lower().removesuffix("_resized") not in SCENES:
         return False
-    return colmap_layout.is_in_folders(path / model[1])
+    images = path / model[1]
+    if not colmap_layout.is_in_folders(images) or (path / our_format.TEST).exists():
+        return False
+    folders, _ = colmap_layout.scan(images)
+    return not any(colmap_layout.scan(images / folder)[0] for folder in folders)
 
 
 def read(path: Path, *, model: FoundModel | None = None) -> Scene:

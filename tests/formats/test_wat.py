@@ -57,6 +57,18 @@ def test_where_the_readings_differ_the_format_must_be_named(colmap_folder):
     assert orders == {"wat": ["t10", "t2"], "colmap-folders": ["t2", "t10"]}
 
 
+def test_a_project_that_only_has_the_name_is_plain(colmap_folder):
+    """A list of test images counts, and folders within those of the periods are no periods."""
+    folder = colmap_folder(names(["t1", "t2"]), name="street")
+    (folder / "sparse/0/test.txt").write_text("t1/01.png\n")
+    scene = read_scene(folder)
+    assert scene.format == "colmap-folders"
+    assert [f.name for f in scene.select(split="test")] == ["t1/01.png"]
+    deep = read_scene(colmap_folder(names(["t1/left", "t1/right", "t2/left"]), name="car"))
+    assert (deep.format, [p.label for p in deep.periods]) == ("colmap-folders", ["t1", "t2"])
+    assert read_scene(folder, format="wat").format == "wat"
+
+
 def test_images_outside_of_tasks_are_refused(colmap_folder):
     with pytest.raises(SceneError, match=r"every image in the folder of its task, found 'a.png'"):
         read_scene(colmap_folder(["a.png", "b/c.png"], name="mac"), format="wat")
