@@ -52,6 +52,9 @@ PREPARED_UNIT = 100.0  # Metres
 PARTS_OF_A_CITY = ("train", "test", "train_dense", "pose", "aerial", "street")
 """Folders named after the purpose or the flight of images: neither blocks nor periods."""
 
+OF_OTHER_SCENES = ("images", "sparse")
+"""Folders that scenes of most formats have, and blocks of a city do not."""
+
 MAX_DEPTH = 4
 MAX_FOLDERS = 5000  # Folders that are searched, so that a wrong path does not take forever
 
@@ -79,7 +82,16 @@ class PoseFile:
 
 
 def matches(path: Path) -> bool:
-    """Return True if there is a raw file, or a prepared one in a folder ``pose``."""
+    """Return True if there is a raw file, or a prepared one in a folder ``pose``.
+
+    Not where only folders have these, and one is a scene of another format: they are scenes then,
+    not blocks.
+    """
+    if is_raw(path / RAW):
+        return True
+    folders, _ = scan(path)
+    if any((path / folder / part).is_dir() for folder in folders for part in OF_OTHER_SCENES):
+        return False
     return any(
         file.name == RAW or "pose" in file.parts for files, _ in _walk(path) for file in files
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats import detect, matrixcity, read_scene
+from chronoscene.formats import detect, find_scenes, matrixcity, read_scene
 from chronoscene.scene.geometry import camera_centre
 
 EYE_FROM_NADIR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -64,6 +64,19 @@ def test_a_block_alone_is_a_scene(raw_city):
     assert detect(folder).name == "matrixcity"
     scene = read_scene(folder)
     assert [f.name for f in scene.frames] == ["0000.png", "0001.png", "0002.png"]
+
+
+def test_a_folder_of_scenes_is_no_city(raw_city, make_scene_folder):
+    """A city in it would hide the other scenes."""
+    folder = raw_city(["city", "other_city"], name="data")
+    assert [s.path for s in find_scenes(folder)] == [folder]
+    make_scene_folder(name="data/plaza")
+    found = find_scenes(folder)
+    assert [(s.path.name, s.name) for s in found] == [
+        ("city", "matrixcity"),
+        ("other_city", "matrixcity"),
+        ("plaza", "chronoscene"),
+    ]
 
 
 def test_blocks_of_one_city_are_one_period(raw_city):
