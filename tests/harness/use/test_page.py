@@ -321,4 +321,38 @@ def test_in_a_browser(bench_here, tmp_path, browser):
     assert page.evaluate("viewer.app.mixture().wipe") == 0.5
     page.keyboard.press("m")
     assert "no metres" in page.text_content("#message")
+    page.keyboard.press(",")  # a period ends the comparison
+    assert page.evaluate("[viewer.app.mode, viewer.app.period]") == ["years", 0]
+    page.focus("#period")  # keys work there, too
+    page.keyboard.press("2")
+    assert page.input_value("#period") == "1"
+    page.keyboard.press("m")
+    page.evaluate("viewer.app.hover(0, 0); viewer.app.marked = viewer.app.frames()[0]")
+    page.keyboard.press("1")  # the camera under the mouse is of the other period
+    page.wait_for_function("viewer.app.marked === null")
+    make_page(outcome.finished, tmp_path / "one", "--period", "0")
+    page.goto((tmp_path / "one" / "index.html").as_uri() + "#mode=wipe")
+    page.evaluate("viewer.ready")
+    assert not page.is_visible("#modes") and not page.is_visible("#period")
+    assert page.evaluate("viewer.app.mixture().wipe") is None
+    assert page.is_visible("#ticks button")
     assert problems == []
+
+
+def test_many_periods_and_long_names_on_a_phone(trained, tmp_path, browser):
+    make_page([trained["chronogs"]], tmp_path / "page")
+    index = tmp_path / "page" / "index.html"
+    text = index.read_text(encoding="utf-8")
+    names = [f"the {i}th day of the year 2016" for i in range(12)]
+    text = text.replace('["spring","autumn"]', json.dumps(names))
+    index.write_text(text, encoding="utf-8")
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.goto(index.as_uri())
+    page.evaluate("viewer.ready")
+    page.keyboard.press("]")
+    page.wait_for_timeout(200)
+    assert page.locator("#ticks button:visible").all_text_contents() == names[:1]
+    places = [page.locator(name).bounding_box() for name in ("main", "footer")]
+    assert places[0]["y"] + places[0]["height"] <= places[1]["y"]
+    page.click("[data-mode=wipe]")
+    assert page.locator("#first").bounding_box()["width"] > 300

@@ -20,6 +20,7 @@ class App {
     this.mode = "years";
     this.wipe = 0.5;
     const last = scene.periods.length - 1;
+    this.canCompare = scene.runs.length > 1 || last > 0;
     this.pair = scene.runs.length > 1 ? [[0, 0], [1, 0]] : [[0, 0], [0, last]];
     this.blinkSecond = false;
     this.cameras = true;
@@ -105,10 +106,12 @@ class App {
     const ratio = devicePixelRatio || 1, context = this.lines.getContext("2d"), size = [w, h];
     [this.lines.width, this.lines.height] = [w * ratio, h * ratio];
     context.scale(ratio, ratio);
-    drawFrusta(context, this.view, size, this.frames(), this.scene.frustum, this.marked);
+    const frames = this.frames();
+    if (!frames.includes(this.marked)) this.marked = null;
+    drawFrusta(context, this.view, size, frames, this.scene.frustum, this.marked);
     if (this.frame) drawOutline(context, this.view, size);
-    drawMeasure(context, this.view, size, this.points, this.measured());
     if (this.mode === "wipe") drawWipe(context, size, this.wipe);
+    drawMeasure(context, this.view, size, this.points, this.measured());
     if (this.marked) label(context, this.marked.name, ...this.pointer);
   }
 
@@ -129,7 +132,7 @@ class App {
 
   /** Change the view by a function of it; the photo beside it is left. */
   move(change) {
-    this.flight = null;
+    this.flight = this.marked = null;
     this.view = change(this.view);
     if (this.frame) this.leave();
     this.changed();
@@ -197,6 +200,12 @@ class App {
     this.marked = marked;
   }
 
+  /** The mouse has left the canvas. */
+  unmark() {
+    if (this.marked) this.request();
+    this.marked = null;
+  }
+
   /** Touch or click on a place: measure from or to there, or visit the camera that is there. */
   tap(x, y, reach) {
     const { clientWidth: w, clientHeight: h } = this.canvas;
@@ -256,7 +265,7 @@ class App {
   }
 
   setMode(mode) {
-    this.mode = mode;
+    this.mode = this.canCompare ? mode : "years";
     this.blinkSecond = false;
     clearInterval(this.blinking);
     if (mode === "blink") {
@@ -289,20 +298,18 @@ class App {
 
   /** Do what a key stands for; true if it stands for anything. */
   key(key) {
-    if (/^[1-9]$/.test(key) && key <= this.scene.periods.length) {
+    const toPeriod = period => () => {
       if (this.mode !== "years") this.setMode("years");
-      this.setPeriod(key - 1);
-      return true;
-    }
+      this.setPeriod(period);
+    };
     const toggled = mode => () => this.setMode(this.mode === mode ? "years" : mode);
     const action = {
       b: toggled("blink"), x: toggled("wipe"),
-      ",": () => this.setPeriod(Math.ceil(this.period) - 1),
-      ".": () => this.setPeriod(Math.floor(this.period) + 1),
+      ",": toPeriod(Math.ceil(this.period) - 1), ".": toPeriod(Math.floor(this.period) + 1),
       "[": () => this.step(-1), "]": () => this.step(1),
       c: () => this.toggleCameras(), m: () => this.toggleMeasuring(), h: () => this.home(),
       escape: () => this.frame && this.move(view => view), "?": () => this.panel.help(),
-    }[key];
+    }[key] || (/^[1-9]$/.test(key) && key <= this.scene.periods.length && toPeriod(key - 1));
     if (action) action();
     return Boolean(action);
   }

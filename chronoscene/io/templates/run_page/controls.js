@@ -36,6 +36,7 @@ function listenToPointers(element, app) {
       && travelled < TAP) app.tap(...place(event), event.pointerType === "touch" ? 22 : 12);
   };
   element.addEventListener("pointerup", end);
+  element.addEventListener("pointerleave", () => app.unmark());
   element.addEventListener("pointercancel", end);
   element.addEventListener("contextmenu", event => event.preventDefault());
   element.addEventListener("wheel", event => {
@@ -87,8 +88,9 @@ function listenToKeys(app) {
   };
   document.addEventListener("keydown", event => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.target.closest("input, select, dialog")) return;
+    if (event.target.closest("select, dialog")) return;
     const plain = event.key.toLowerCase(), shifted = `shift+${plain}`;
+    if (event.target.closest("input") && plain.startsWith("arrow")) return;  // moves the slider
     const key = event.shiftKey && FLIGHT[shifted] ? shifted : plain;
     if (FLIGHT[key]) {
       event.preventDefault();

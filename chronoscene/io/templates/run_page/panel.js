@@ -13,6 +13,11 @@ class Panel {
     });
     this.fillTicks();
     this.fillChoices();
+    byId("modes").hidden = !app.canCompare;
+    slider.hidden = scene.periods.length < 2;
+    const footer = document.querySelector("footer");
+    new ResizeObserver(() => document.body.style.setProperty("--footer", `${footer.offsetHeight}px`))
+      .observe(footer);
     for (const button of document.querySelectorAll("[data-mode]")) {
       button.addEventListener("click", () => app.setMode(button.dataset.mode));
     }
