@@ -22,7 +22,7 @@ from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import boxed_text
 
-TITLE = 40  # Letters of both labels that fit above a map
+TITLE = 42  # Letters of both labels that fit above a map
 BETWEEN = click.option(
     "--between",
     nargs=2,

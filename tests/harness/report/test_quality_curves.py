@@ -6,6 +6,7 @@ from made_runs import record
 
 from chronoscene.harness.files.records import CURVE_FILE
 from chronoscene.harness.report.quality_curves import STYLES, draw_curves
+from chronoscene.io.pages import TEMPLATES
 
 HEADER = "seconds,iteration,primitives,psnr,parameters,model\n"
 
@@ -55,3 +56,14 @@ def test_devices_have_plots_of_their_own(tmp_path):
     found = [run(tmp_path / device, probes, device=device) for device in ("cpu", "cuda")]
     for device, plot in zip(("cpu", "cuda"), draw_curves(found), strict=True):
         assert f"training [s] on {device}</text>" in plot.svg
+
+
+def test_the_large_letters_on_a_phone_do_not_collide(tmp_path, browser):
+    (curves,) = draw_curves([run(tmp_path / "a", "5,1,1,20,1,all\n10,2,1,24,1,all\n")])
+    style = (TEMPLATES / "comparison" / "style.css").read_text(encoding="utf-8")
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.set_content(f"<style>{style}</style>{curves.svg}")
+    found = page.locator(".plot text")
+    boxes = {text.text_content(): text.bounding_box() for text in found.all()}
+    label = boxes.pop("PSNR [dB]")
+    assert all(box["x"] > label["x"] + label["width"] for box in boxes.values())

@@ -185,6 +185,8 @@ def test_titles_of_maps_are_no_wider_than_these():
     made = ChangeMap((0, 1), np.zeros((1, 3)), *np.zeros((2, 1), bool), *np.zeros((2, 1)))
     known = {"0": "before the works", "1": "after the works"}
     assert _panel(made, known).title == "before the works \N{RIGHTWARDS ARROW} after the works"
+    known = {"0": "warm evening 2017", "1": "cool autumn morning 2018"}
+    assert _panel(made, known).title == " \N{RIGHTWARDS ARROW} ".join(known.values())
     survey = "survey of the year {} by helicopter"
     title = _panel(made, {"0": survey.format(1970), "1": survey.format(1971)}).title
     assert title == "0: survey of the... \N{RIGHTWARDS ARROW} 1: survey of the..."
