@@ -11,7 +11,7 @@ import numpy as np
 
 from chronoscene.arrays import Array, Pixels
 from chronoscene.errors import ChronoSceneError
-from chronoscene.figures.canvas import UNSEEN_COLOR, period_colors, rgb_of
+from chronoscene.figures.canvas import rgb_of
 from chronoscene.figures.change_map import colors_of
 from chronoscene.harness.use.changes import ChangeMap
 from chronoscene.harness.view.content import EXTENT, Content, vertical_fov
@@ -58,9 +58,9 @@ class Layers:
         cloud = self._content.cloud
         numbers = np.flatnonzero(np.isfinite(cloud.xyz).all(axis=1))
         numbers = np.random.default_rng(0).permutation(numbers)[:MAX_POINTS]
-        if period == ALL:  # unseen points have the last colour
-            palette = [rgb_of(color) for color in (*period_colors(len(cloud.labels)), UNSEEN_COLOR)]
-            colors = np.array(palette).astype(np.uint8)[cloud.period[numbers]]
+        if period == ALL:
+            groups, palette = cloud.groups()
+            colors = np.array([*map(rgb_of, palette)]).astype(np.uint8)[groups[numbers]]
         else:
             numbers = numbers[np.isin(cloud.period[numbers], (period, -1))]
             colors = self._content.scene.points.rgb[numbers]

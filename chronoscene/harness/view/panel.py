@@ -6,9 +6,11 @@ import math
 import threading
 from concurrent.futures import CancelledError
 from functools import partial
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 from chronoscene.errors import ChronoSceneError
+from chronoscene.figures.canvas import UNSEEN
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.view.content import Content, vertical_fov
 from chronoscene.harness.view.layers import ALL, Layers
@@ -112,10 +114,20 @@ class Viewer:
         start = POINTS[0 if runs else min(len(self._labels), 2)]
         with gui.add_folder("Scene"):
             self._points = gui.add_dropdown("Sparse points", POINTS, initial_value=start)
+            self._legend = gui.add_html(self._legend_of_points())
             hint = "yellow: test, blue: training; a click goes there"
             self._cameras = gui.add_checkbox("Cameras", not runs, hint=hint)
             self._photo: Any = None
         return [self._points, self._cameras]
+
+    def _legend_of_points(self) -> str:
+        """Return HTML with the colours of the points of all periods."""
+        _, colors = self._content.cloud.groups()
+        entries = [
+            f'<div><span style="color: {color}">\N{BLACK SQUARE}</span> {escape(name)}</div>'
+            for color, name in zip(colors, (*self._labels, UNSEEN), strict=False)
+        ]
+        return f'<div style="margin: 0 1em; font-size: 0.85em">{"".join(entries)}</div>'
 
     def _add_path(self) -> None:
         gui = self._client.gui
@@ -155,6 +167,7 @@ class Viewer:
             self._from.visible = self._to.visible = self._changes.value
             choices = dict(zip(POINTS, (None, round(period), ALL), strict=True))
             self._layers.show_points(choices[self._points.value])
+            self._legend.visible = choices[self._points.value] == ALL
             self._layers.show_cameras(round(period) if self._cameras.value else None)
         self._layers.add_photos()
         self._compare()

@@ -19,6 +19,7 @@ from PIL import Image
 
 from chronoscene.cli import cli
 from chronoscene.errors import ChronoSceneError, ConfigError
+from chronoscene.figures.canvas import period_colors
 from chronoscene.formats import read_scene
 from chronoscene.harness.use.cameras import find_viewpoints
 from chronoscene.harness.use.trained_run import open_run
@@ -219,6 +220,16 @@ def test_a_scene_has_points_and_cameras(scene_folder, serve):
     browser = enter(server)
     browser.wait(lambda: len(browser.of("CameraFrustumMessage")) == 4)
     assert browser.of("PointCloudMessage")[0]["name"] == "/points/-1"
+    (legend,) = browser.of("GuiHtmlMessage")
+    for color, label in zip(period_colors(2), server._content.cloud.labels, strict=True):
+        assert re.search(f"{color}[^>]*>[^>]*> {label}<", legend["props"]["content"])
+    browser.set("Sparse points", POINTS[1])
+
+    def hidden():
+        updates = [m for m in browser.of("GuiUpdateMessage") if m["uuid"] == legend["uuid"]]
+        return updates and updates[-1]["updates"] == {"visible": False}
+
+    browser.wait(hidden)
 
     def photos():
         updates = browser.of("SceneNodeUpdateMessage")
