@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene import formats
-from chronoscene.colmap.raw_model import model_files
+from chronoscene.colmap.raw_model import find_model, model_files
 from chronoscene.convert import remarks_on
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import DetectedFormat
@@ -60,8 +60,8 @@ DETECT = ReadOptions()
 def find_folders(path: Path) -> list[Path]:
     """The folder itself if it looks like a scene, else its subfolders that do, sorted.
 
-    A folder looks like a scene if it has ``sparse/`` or ``images/``, model files, or the files of
-    another format.
+    A folder looks like a scene if it has ``sparse/`` or ``images/``, a model where programs leave
+    it, or the files of another format.
 
     Raises:
         SceneError: If nothing looks like a scene.
@@ -92,7 +92,7 @@ def _looks_like_scene(path: Path) -> bool:
         return True
     if formats.project_above(path) is not None:
         return False  # a part of it
-    ours = (path / "sparse").is_dir() or bool(model_files(path))
+    ours = (path / "sparse").is_dir() or bool(model_files(path)) or find_model(path) is not None
     return ours or other_format(path) is not None
 
 

@@ -149,6 +149,19 @@ def test_no_scene_at_all(tmp_path):
         find_folders(tmp_path / "file")
 
 
+@pytest.mark.parametrize("place", ["dense", "dense/0"])
+def test_a_model_that_other_commands_find_is_found(scene, tmp_path, place):
+    """As COLMAP leaves it: undistorted, with the images beside it."""
+    project = tmp_path / "project"
+    (project / place).mkdir(parents=True)
+    scene.path("images").rename(project / place / "images")
+    scene.path("sparse/0").rename(project / place / "sparse")
+    assert find_folders(project) == [project]
+    findings = {f.code: f for f in validate_scene(project).findings}
+    assert f"a model in {place}/sparse/" in findings["CS002"].found
+    assert "--period-by" in findings["CS301"].remedy
+
+
 def test_empty_scene_folder_gives_findings(tmp_path):
     (tmp_path / "images").mkdir()
     codes = {f.code for f in validate_scene(tmp_path).findings}

@@ -66,7 +66,7 @@ def _similar_files(scene: RawScene) -> list[str]:
 
 def _convert(scene: RawScene) -> str | None:
     """The remedy if there are a model and images, so that the command can write the file."""
-    if scene.model_place is None or not scene.files:
+    if scene.model_place is None or not (scene.root / scene.model_images).is_dir():
         return None
     return (
         'write one line "<image name> <period id>" for each image; or let chronoscene convert DIR '

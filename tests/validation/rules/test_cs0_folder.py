@@ -262,11 +262,15 @@ def test_dates_that_contradict_the_folders_of_a_project(project):
 
 def test_projects_whose_test_images_their_format_chooses(project, tmp_path):
     street = project.root.rename(tmp_path / "street")  # a name of WAT, which has no test.txt
+    assert [p.test for p in validate_scene(street).summary.periods] == [3, 3]
+    (street / "sparse/0/test.txt").write_text("")
+    report = validate_scene(street, options=ReadOptions("wat"))
+    assert [(p.images, p.test) for p in report.summary.periods] == [(9, 2), (9, 2)]
+    assert codes(report) == {"CS006", "CS507"}
+    (street / "sparse/0/test.txt").unlink()
     report = validate_scene(street)
     assert [(p.images, p.test) for p in report.summary.periods] == [(9, 2), (9, 2)]
     assert codes(report) == {"CS006", "CS507"}
-    (street / "sparse/0/test.txt").write_text("")
-    assert codes(validate_scene(street)) == {"CS006", "CS507"}
 
 
 def test_a_project_of_two_formats(project, tmp_path):
@@ -274,6 +278,7 @@ def test_a_project_of_two_formats(project, tmp_path):
     (project.path("images/2023")).rename(project.path("images/t2"))
     for old, new in (("2016/", "t10/"), ("2023/", "t2/")):
         project.replace("sparse/0/images.txt", old, new)
+    project.path("sparse/0/test.txt").unlink()
     street = project.root.rename(tmp_path / "street")
     (said,) = [f for f in validate_scene(street).findings if f.code in ("CS007", "CS301")]
     assert (said.code, said.found) == ("CS007", "marks of colmap-folders and wat")
