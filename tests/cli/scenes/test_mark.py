@@ -34,13 +34,13 @@ def test_photos_and_clicks_that_the_page_does_not_show_are_named(
     tmp_path: Path, captures: Path
 ) -> None:
     (captures / "2.jpg").write_bytes(b"no photo")
-    (captures / "3.heic").touch()
+    (captures / "3.dng").touch()
     clicks = tmp_path / "points.csv"
     clicks.write_text("p,0.jpg,12,34\np,9.jpg,56,78\n", "utf-8")
     done = run_command("mark", captures, tmp_path / "page.html", "--tie-points", clicks)
     assert done.exit_code == 0
     assert "note: 2.jpg is not on the page: cannot be decoded" in done.stderr
-    assert "note: 1 photo in formats that are not read (.heic), such as 3.heic" in done.stderr
+    assert "note: 1 photo in formats that are not read (.dng), such as 3.dng" in done.stderr
     assert "note: 1 click in photos that are not in CAPTURES, such as '9.jpg'" in done.stderr
     assert "page.html: 2 photos" in done.stdout
 
