@@ -137,6 +137,8 @@ class Opened:
     def open(self, page: Path) -> None:
         self.tab.goto(f"file://{page}")
         self.tab.wait_for_function("picture().complete && $('points').children.length")
+        # Until the photo fits into the window, a place in it may be elsewhere a moment later.
+        self.tab.evaluate("new Promise(d => requestAnimationFrame(() => requestAnimationFrame(d)))")
         self.tab.locator("#view").focus()
 
     def mark(self, xy: Any) -> None:
