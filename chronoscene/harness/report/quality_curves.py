@@ -48,7 +48,6 @@ def _draw(records: Sequence[RunRecord], device: str) -> Curves | None:
     time = fill(f"training [s] on {canvas.plain(device)}", 48)
     axes = figure.add_subplot(xlabel=time, ylabel="PSNR [dB]")
     canvas.quiet_axes(axes)
-    axes.yaxis.labelpad = 16  # on a phone, the page has larger letters
     axes.grid(axis="y", color=canvas.GRID, linewidth=0.6)
     methods = list(dict.fromkeys(record.method for record in records))
     colors = dict(zip(methods, canvas.period_colors(len(methods)), strict=True))

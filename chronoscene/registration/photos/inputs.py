@@ -364,7 +364,7 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
     if turned:
         remarks.append(f"{turned} photos have an orientation tag: set to 1, pixels left as stored")
     if converted:
-        remarks.append(f"{converted} files converted to PNG: they were not plain 8-bit RGB or grey")
+        remarks.append(f"{converted} files converted to PNG: COLMAP does not read them as they are")
     if renamings := sum(a != c.name for a, c in zip(plain, captures, strict=True)):
         remarks.append(f"spaces in the names of {renamings} photos replaced by underscores")
     return names, remarks
@@ -417,8 +417,7 @@ def renamed(captures: Sequence[Capture], names: Sequence[str]) -> tuple[Capture,
 def _is_plain(path: Path) -> bool:
     """Return True if COLMAP reads a file in colour, as it is stored."""
     with Image.open(path) as image:
-        if image.format in ("HEIF", "AVIF"):
-            return False
-        plain = image.mode in _PLAIN_MODES and getattr(image, "n_frames", 1) == 1
+        read = image.format not in ("HEIF", "AVIF") and image.mode in _PLAIN_MODES
+        plain = read and getattr(image, "n_frames", 1) == 1
         turned_tiff = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) != 1
     return plain and not turned_tiff

@@ -58,7 +58,7 @@ def test_devices_have_plots_of_their_own(tmp_path):
         assert f"training [s] on {device}</text>" in plot.svg
 
 
-def test_the_large_letters_on_a_phone_do_not_collide(tmp_path, browser):
+def test_the_label_does_not_collide_with_the_numbers_on_a_phone(tmp_path, browser):
     (curves,) = draw_curves([run(tmp_path / "a", "5,1,1,20,1,all\n10,2,1,24,1,all\n")])
     style = (TEMPLATES / "comparison" / "style.css").read_text(encoding="utf-8")
     page = browser.new_page(viewport={"width": 390, "height": 844})

@@ -84,7 +84,7 @@ def test_photos_of_phones(suffix: str, tmp_path: Path) -> None:
     assert names == [f"{p}/{n}" for p in ("after", "before") for n in (f"a.{suffix}", "b.jpg")]
     placed, remarks = place_photos(found.images, tmp_path / "placed")
     assert placed[0] == f"after/a.{suffix}.png" and placed[1] == "after/b.jpg"
-    assert remarks == ["2 files converted to PNG: they were not plain 8-bit RGB or grey"]
+    assert remarks == ["2 files converted to PNG: COLMAP does not read them as they are"]
     pixels = load_rgb(tmp_path / "placed" / placed[0])
     np.testing.assert_array_equal(pixels, load_rgb(root / names[0]))
 
