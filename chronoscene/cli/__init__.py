@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 
 import click
@@ -146,6 +147,10 @@ def main() -> None:
     except click.Abort:  # Ctrl-C: 1 would say that something failed
         click.secho("interrupted; what was finished before is kept", err=True)
         sys.exit(INTERRUPTED)
+    except SystemExit as end:
+        if end.code == 128 + signal.SIGTERM:
+            click.secho("terminated; what was finished before is kept", err=True)
+        raise
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)

@@ -28,6 +28,7 @@ from typing import Any
 from chronoscene.checks import check_choice, load_entry
 from chronoscene.colmap.raw_model import FoundModel, find_model, find_stray_model
 from chronoscene.errors import ConfigError, SceneError
+from chronoscene.io.wording import joined
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import SPLIT
 
@@ -145,7 +146,7 @@ class DetectedFormat:
             raise SceneError(
                 self.path,
                 expected="a folder of one format",
-                found=f"marks of {' and '.join([self.name, *self.others])}",
+                found=f"marks of {joined([self.name, *self.others])}",
                 todo="name one with --dataset-format, in chronoscene convert or in this command",
             )
 

@@ -34,6 +34,12 @@ def shown(items: Iterable[str], limit: int = 3) -> str:
     return ", ".join(map(quote, names[:limit])) + (f" and {rest} more" if rest > 0 else "")
 
 
+def joined(words: Iterable[str]) -> str:
+    """Join words: ``A``, ``A and B``, ``A, B and C``."""
+    *others, last = words
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 def counted(number: int, noun: str) -> str:
     """Count a noun: ``1 image``, ``2 images``."""
     return f"{number} {noun}" + ("" if number == 1 else "s")

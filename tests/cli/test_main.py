@@ -87,6 +87,7 @@ def test_a_command_that_is_asked_to_end_leaves_nothing_behind(tmp_path):
     _, told = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM, told
     assert "Traceback" not in told
+    assert told.endswith("terminated; what was finished before is kept\n")
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]
 
 

@@ -89,9 +89,12 @@ def leaderboard_command(
     verified = claimed.pop("", 0)
     outdated = sum(standing.entry.outdated for standing in board.standings)
     click.echo(
-        f"{len(board.standings)} measured entries: {verified} verified, {claimed.total()} claimed, "
-        f"{outdated} of older code, {pictured} with pictures"
+        f"measured entries: {len(board.standings)}; verified: {verified}; "
+        f"claimed: {claimed.total()}; of older code: {outdated}; with pictures: {pictured}"
     )
+    if runs and not pictured:
+        folders = ", ".join(map(str, runs))
+        click.echo(f"no pictures: no run in {folders} is the first one of an entry")
     for reason, number in claimed.items():
         click.echo(f"claimed: {number}: {reason}")
     report_written(out / "index.html")

@@ -21,7 +21,7 @@ from chronoscene.harness.plan.resolve import ResolvedMethod, ResolvedRun, resolv
 from chronoscene.harness.plan.scenes import BenchScene, read_scenes
 from chronoscene.harness.plan.settings import BenchSettings
 from chronoscene.io.log import Log
-from chronoscene.kernels.runtime import check_device
+from chronoscene.kernels.runtime import available_threads, check_device
 
 BUDGET_NOTICE = "--budget: schedules follow the clock, and equal seeds do not give equal models"
 
@@ -45,6 +45,8 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     if settings.ray is None:  # else the machine that runs a job checks its own
         gsplat = any(method.spec.draws_gaussians for method in methods)
         check_device(shared.device, gsplat=gsplat)
+        if (shared.threads or 0) > (there := available_threads()):
+            log(f"note: --threads {shared.threads}: a run has {there}, one for each processor")
     runs: dict[Path, ResolvedRun] = {}
     todo: dict[Path, ResolvedRun] = {}
     for scene in read_scenes(settings, log):

@@ -46,11 +46,15 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
             found, validation=settings.run.validation, shrink=settings.run.shrink
         )
         if scene.name in scenes:
+            other = scenes[scene.name][0].root
+            twice = other.samefile(scene.root)
             raise ConfigError(
                 scene.root,
-                expected="a scene with a unique name",
-                found=f"{scene.name!r}, the name of {scenes[scene.name][0].root} too",
-                todo="rename a folder, or run the scenes with different --out",
+                expected="each scene once" if twice else "a scene with a unique name",
+                found="it twice" if twice else f"{scene.name!r}, the name of {other} too",
+                todo="name it once"
+                if twice
+                else "rename a folder, or run the scenes with different --out",
             )
         check_not_among_runs(scene, settings.run.runs)
         check_scene(scene)

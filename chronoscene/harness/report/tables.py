@@ -45,6 +45,8 @@ MAX_PERIODS = 8
 """Periods that have columns beside the aggregates, and that stand in one table."""
 MAX_SCENES = 7
 """Scenes in one table of the overview; the paper has six and their mean."""
+FEW_VIEWS = 8
+"""Notes name the test views of a period if there are fewer."""
 ALL_SCENES = "mean of scenes"
 COST_TITLES = {cost.name: cost.title for cost in COSTS}
 
@@ -435,8 +437,11 @@ def footnotes(
             "unknown and not in it"
         )
     if entries.tied.any():
+        of_periods = entries[entries.tied & entries.column.str.startswith("period ")]
+        fewest = min(map(len, of_periods.views), default=FEW_VIEWS)
         notes.append(
             "†: at 95 %, not separated from the best of its column, which was chosen among all"
+            + (f"; {fewest} test views of a period separate little" * (fewest < FEW_VIEWS))
         )
     for name, title in (("device", "device"), ("commit", "code")):
         values = dict.fromkeys(str(getattr(run, name)) for run in records)

@@ -158,9 +158,9 @@ def train(
 
     Raises:
         DivergedError: If the method skipped too many steps in a row.
-        TrainingError: If it took as many steps with a loss that is not finite, no view shows the
-            model any more, no view ever did, nothing is left of it, or all probe views are blank in
-            the end.
+        TrainingError: If the budget is over before the first step, the method took as many steps
+            with a loss that is not finite, no view shows the model any more, no view ever did,
+            nothing is left of it, or all probe views are blank in the end.
         CheckpointError: If all checkpoints are damaged.
         MethodError: If the method returns a wrong type or value.
     """
@@ -178,6 +178,13 @@ def train(
         state, waiting.seconds = restored, restored.waited_seconds
         clock.seconds = state.seconds + state.waited_seconds
     done = stop.progress(state.iterations, state.seconds)
+    if done >= 1.0 and state.iterations == 0 and stop.seconds is not None:
+        raise TrainingError(
+            f"model {part.name}",
+            expected="time for training after the set-up",
+            found=f"{seconds:.3g} s of set-up in {stop.seconds:.3g} s",
+            todo="give it a longer --budget",
+        )
     due = [share for share in PROBE_SHARES if share > done]
     last_good = state.iterations
     # Losses of the latest steps, if those were empty. Views come once per pass, so two passes

@@ -21,7 +21,7 @@ from chronoscene.images.store import ImageStore
 from chronoscene.io.pages import render_page
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import staged_folder
-from chronoscene.io.wording import counted
+from chronoscene.io.wording import counted, joined
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.geometry import camera_centre
@@ -331,7 +331,7 @@ def _page(
         notes.append(f"To keep the page small, it lacks {reduction}.")
     if missing:
         notes.append(f"To keep the page small, it lacks {counted(missing, 'photo')}.")
-    names = " and ".join(dict.fromkeys(run.spec.title for run in runs))
+    names = joined(dict.fromkeys(run.spec.title for run in runs))
     data = json.dumps(document, ensure_ascii=False, separators=(",", ":"))
     return render_page(
         "run_page/index",

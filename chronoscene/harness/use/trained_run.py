@@ -27,7 +27,7 @@ from chronoscene.harness.files.source import RunSource, read_source
 from chronoscene.harness.files.strategies import STRATEGIES, Strategy, period_part
 from chronoscene.harness.score.views import PredictedView, read_views
 from chronoscene.images.store import ImageStore
-from chronoscene.io.wording import quote
+from chronoscene.io.wording import joined, quote
 from chronoscene.kernels.runtime import check_device
 from chronoscene.methods import (
     Method,
@@ -130,7 +130,7 @@ class TrainedRun:
             raise ConfigError(
                 f"period {text!r}",
                 expected="the label of one period",
-                found=f"that of {' and '.join(named)}",
+                found=f"that of {joined(named)}",
                 todo="name it by its number",
             )
         if named:

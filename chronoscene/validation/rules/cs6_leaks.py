@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap.raw_model import RawImages
-from chronoscene.io.wording import shown
+from chronoscene.io.wording import joined, shown
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.grouping import grouped
 from chronoscene.validation import rule
@@ -66,7 +66,7 @@ def leak_periods(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
     for kind, group in _equal(scene):
         listed = sorted({periods[n] for n in group})
         if len(listed) > 1:
-            found = f"the same {kind} in periods {' and '.join(map(str, listed))}: {shown(group)}"
+            found = f"the same {kind} in periods {joined(map(str, listed))}: {shown(group)}"
             yield Hit(f"images/{group[0]}", "an image of one period", found, also=tuple(group[1:]))
 
 
