@@ -20,6 +20,7 @@ from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.images.decoding import HEIF_SUFFIXES, HEIF_TODO, reads_heif
 from chronoscene.images.exif import read_exif, taken_at
+from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.photo import Capture, open_photo
@@ -62,15 +63,15 @@ class Captures:
     """Periods with photos that were taken at another time by their metadata, in words."""
     left_out: tuple[str, ...] = ()
     """Photos of which no period is known, in words."""
-    unplaced: tuple[str, ...] = ()
-    """Photos whose GPS position names no hemisphere, in words."""
+    unused: tuple[str, ...] = ()
+    """GPS positions and masks that are not used, in words."""
     undisputed: frozenset[Path] = frozenset()
     """Files of the photos whose own dates may date their period."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Everything to be said about periods and positions, for the end of a command."""
-        return (*self.left_out, *self.misdated, *self.unplaced)
+        """Everything to be said about what is missing or doubtful, for the end of a command."""
+        return (*self.left_out, *self.misdated, *self.unused)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,13 +145,14 @@ def photos_in(folder: Path) -> list[Path]:
     """List image files below a folder, sorted, without hidden files and folders; links count.
 
     Phones write HEIC, and AVIF is alike: these are listed if they can be read, and if the same
-    photo is not there in another form.
+    photo is not there in another form. Files in ``masks/`` are masks if there are other photos.
     """
     files = list(_files_in(folder))
     photos = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES]
     known = {p.with_suffix("") for p in photos}
     others = [p for p in files if _is_read(p.suffix.lower()) and p.with_suffix("") not in known]
-    return sorted([*photos, *others], key=lambda p: p.relative_to(folder).as_posix())
+    found = sorted([*photos, *others], key=lambda p: p.relative_to(folder).as_posix())
+    return [p for p in found if folder / MASKS not in p.parents] or found
 
 
 def _is_read(suffix: str) -> bool:
@@ -219,8 +221,9 @@ def _left_out(photos: Sequence[Path], why: str) -> list[str]:
         return []
     names = ", ".join(p.name for p in photos[:3]) + (", ..." if len(photos) > 3 else "")
     return [
-        f"{len(photos)} photos {why}, so their period is unknown: {names}; they are left out; move "
-        "them to the folder of their period, or give a table of images and periods (--table)"
+        f"photos that {why}, so their period is unknown: {len(photos)} ({names}); they are left "
+        "out; move them to the folder of their period, or give a table of images and periods "
+        "(--table)"
     ]
 
 
@@ -278,7 +281,7 @@ def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str], 
     for group in groups:
         label = group[0][0].date().isoformat()
         listed += [_Listed(p, p.relative_to(root).as_posix(), label) for _, p in group]
-    labels = ", ".join(f"{g[0][0].date()} ({len(g)} photos)" for g in groups)
+    labels = ", ".join(f"{g[0][0].date()} ({counted(len(g), 'photo')})" for g in groups)
     remark = f"periods proposed from the dates of the photos: {labels}"
     return listed, [remark], _left_out(undated, "have no date")
 
@@ -339,8 +342,8 @@ def _assemble(
         for label, mine, others in zip(order, dated, wrong, strict=True)
         if others
     )
-    unplaced = _unplaced(images)
-    remarks = (*(proposed or ()), f"periods: {shown}", *left_out, *misdated, *unplaced)
+    unused = (*_unplaced(images), *_unmasked(root, images))
+    remarks = (*(proposed or ()), f"periods: {shown}", *left_out, *misdated, *unused)
     disputed = {name for others in wrong for name, _ in others}
     return Captures(
         root,
@@ -350,7 +353,7 @@ def _assemble(
         remarks,
         misdated,
         left_out=tuple(left_out),
-        unplaced=unplaced,
+        unused=unused,
         undisputed=frozenset(c.path for c in images if c.name not in disputed),
     )
 
@@ -365,6 +368,17 @@ def _unplaced(images: Sequence[Capture]) -> tuple[str, ...]:
         "N or S, or without E or W; it is not used; write what is missing with exiftool "
         "(GPSLatitudeRef, GPSLongitudeRef)",
     )
+
+
+def _unmasked(root: Path, images: Sequence[Capture]) -> tuple[str, ...]:
+    """Name a folder of masks of which no photo has one; nothing if there is none."""
+    folders = [
+        folder for parent in (root, root.absolute().parent) if (folder := parent / MASKS).is_dir()
+    ]
+    if not folders or any(c.mask for c in images):
+        return ()
+    name = images[0].name
+    return (f"no mask in {folders[0]} is used: that of {name} would be {mask_place(name)}",)
 
 
 _Dated = list[tuple[str, date]]  # Names of photos, and when they were taken

@@ -24,6 +24,7 @@ from chronoscene.images.exif import set_upright
 from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.images.store import place_image
 from chronoscene.io.staging import replacing, sha256_of
+from chronoscene.io.wording import counted
 from chronoscene.registration.context import Context
 from chronoscene.registration.photos.captures import Captures, period_date
 from chronoscene.registration.photos.gps_priors import Positions, locate
@@ -250,7 +251,7 @@ def _place(
     for name, mask in found.items():
         place_image(mask, context.work / mask_place(name), "symlink")
     if found:
-        notes.append(f"masks of {len(found)} photos: no features where they are 0")
+        notes.append(f"masks of {counted(len(found), 'photo')}: no features where they are 0")
     return names, [*remarks, *notes]
 
 
@@ -332,7 +333,7 @@ def drop_saved_again(
             reason = f"the same picture as {first}, saved again: a photo belongs to one date"
             refused.append((captures[i].name, captures[i].period, reason))
     gone = {name for name, *_ in refused}
-    remarks = [f"{len(gone)} photos are pictures of an earlier period, saved again"] if gone else []
+    remarks = [f"pictures of an earlier period, saved again: {len(gone)}"] if gone else []
     return tuple(c for c in captures if c.name not in gone), refused, remarks
 
 

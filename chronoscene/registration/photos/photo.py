@@ -61,7 +61,7 @@ class Capture:
     taken: datetime | None
     gps: Gps | None
     mask: Path | None = None
-    """Its mask file, in ``masks/`` beside the folder of the photos."""
+    """Its mask file, in ``masks/`` beside the folder of the photos or in it."""
     look: bytes = b""
     """Grey levels of the photo reduced to `LOOK_SIDE` pixels a side, by which copies are found."""
 
@@ -87,7 +87,9 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
     if is_panorama(path) or max(width, height) > MAX_ASPECT * min(width, height):
         return f"{width} x {height} pixels: a panorama, which no perspective camera model describes"
     exif = read_exif(path)
-    beside = path.absolute().parents[len(PurePosixPath(name).parts)]
+    above = path.absolute().parents
+    depth = len(PurePosixPath(name).parts)
+    masks = find_masks(above[depth - 1], [name]) | find_masks(above[depth], [name])
     return Capture(
         name=name,
         path=path,
@@ -97,7 +99,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
         exif=exif,
         taken=taken_at(path, exif),
         gps=_position(exif),
-        mask=find_masks(beside, [name]).get(name),
+        mask=masks.get(name),
         look=look,
     )
 

@@ -134,7 +134,7 @@ def test_an_undated_photo_does_not_turn_all_periods_into_one(tmp_path: Path) -> 
     found = read_captures(tmp_path)
     assert [(c.name, c.period) for c in found.images] == [("a.jpg", 0), ("b.jpg", 1)]
     (note,) = found.notes
-    assert "1 photos have no date, so their period is unknown: c.jpg" in note
+    assert "photos that have no date, so their period is unknown: 1 (c.jpg)" in note
     assert "--table" in note and note in found.remarks
 
 
@@ -178,7 +178,10 @@ def test_a_stray_photo_does_not_hide_the_folders_of_the_periods(tmp_path: Path) 
     found = read_captures(tmp_path)
     assert [c.name for c in found.images] == ["2016/a.jpg", "2023/b.jpg"]
     assert [p.label for p in found.periods] == ["2016", "2023"]
-    assert "1 photos lie beside the folders of the periods" in found.notes[0]
+    assert (
+        "photos that lie beside the folders of the periods, so their period is unknown: 1 ("
+        in found.notes[0]
+    )
     assert "map.png" in found.notes[0]
 
 
@@ -264,6 +267,24 @@ def test_masks_lie_beside_the_folder_of_the_photos(tmp_path: Path) -> None:
     (tmp_path / "images/periods.csv").write_text("image,period\n2016/a.jpg,one\n2023/b.jpg,two\n")
     masks = [c.mask for c in read_captures(tmp_path / "images/periods.csv").images]
     assert masks == [mask, None]
+
+
+@pytest.mark.parametrize("place", ["", "all"])
+def test_masks_among_the_photos_are_no_photos(tmp_path: Path, place: str) -> None:
+    for name in ("2016/a.jpg", "2023/b.jpg"):
+        photo(tmp_path / place / name)
+    mask = photo(tmp_path / "masks" / place / "2016/a.jpg.png")
+    found = read_captures(tmp_path)
+    assert [c.mask for c in found.images] == [mask, None]
+    assert not found.notes
+
+
+def test_masks_without_photos_are_named(tmp_path: Path) -> None:
+    for name in ("images/2016/a.jpg", "images/2023/b.jpg", "masks/2016/a.png"):
+        photo(tmp_path / name)
+    (note,) = read_captures(tmp_path / "images").notes
+    would = "no mask in {}/masks is used: that of 2016/a.jpg would be masks/2016/a.jpg.png"
+    assert note == would.format(tmp_path)
 
 
 def test_nothing_to_register_is_said(tmp_path: Path) -> None:

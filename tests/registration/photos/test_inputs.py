@@ -112,7 +112,7 @@ def test_the_same_picture_saved_again_is_no_photo_of_another_date(folder: Path) 
         ("1/worse.jpg", 1),
     ]
     assert "the same picture as 0/a.jpg, saved again" in refused[0][2]
-    assert remarks == ["2 photos are pictures of an earlier period, saved again"]
+    assert remarks == ["pictures of an earlier period, saved again: 2"]
 
 
 def gathered(images: tuple[Capture, ...], captures: Captures) -> inputs.PhotoInputs:
