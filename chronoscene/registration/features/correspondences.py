@@ -77,7 +77,7 @@ def extract_features(
     }
 
     def extract() -> tuple[Any, list[str]]:
-        # The database may be replaced: pairs that an earlier one had may be missing in it.
+        # The database may be made anew: pairs that an earlier one had are missing in it then.
         (context.work / "stage-matches.json").unlink(missing_ok=True)
         found = context.run_task("features", settings | places)
         count = len(found["keypoints"])
@@ -86,15 +86,10 @@ def extract_features(
             f"cameras, {sum(found['focal_known'].values())} with a focal length from EXIF or the "
             "scene"
         )
-        reused = _reused(found["carried"], count, "photos: features")
         lost = [f"{name}: not in the file of features" for name in found["absent"]]
-        return found, [remark, *reused, *lost, *found["remarks"]]
+        return found, [remark, *lost, *found["remarks"]]
 
     return dict(context.stages.run("features", settings, extract))
-
-
-def _reused(count: int, total: int, what: str) -> list[str]:
-    return [f"{count} of {total} {what} reused from an earlier run"] if count else []
 
 
 def _matches(inputs: PhotoInputs, context: Context, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -128,7 +123,6 @@ def _matches(inputs: PhotoInputs, context: Context, given: Mapping[str, Any]) ->
         remarks = [
             f"{pairs} pairs ({kinds}), {found['across_periods']} across periods",
             f"{verified} of {pairs} pairs verified, {inliers} matches",
-            *_reused(found["carried"], pairs, "pairs: matches"),
             f"{found['held_out']} of {found['tracks_of_several_periods']} tracks of several "
             "periods held out",
         ]

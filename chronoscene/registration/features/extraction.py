@@ -1,12 +1,14 @@
 """The task ``features``: images and their features in COLMAP's database. Worker process only.
 
-Images enter the database in the order of the photos, so ids are the same in every run. Features
-that are stored are not computed again, and those of the same photos in an earlier database are
-copied (`feature_reuse`). Features that the user gives take the place of SIFT (`given`).
+Images enter the database in the order of the photos, so ids are the same in every run. A record
+beside the database says what it was made for: that of other photos, cameras or settings is made
+anew. Otherwise, stored features are not computed again. Features that the user gives take the place
+of SIFT (`given`).
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -18,10 +20,12 @@ import cv2
 from chronoscene.images.masks import find_masks
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.io.staging import sha256_of, write_text_atomic
+from chronoscene.registration.features import METHOD
 from chronoscene.registration.features.database import Features, quiet, store_features
-from chronoscene.registration.features.feature_reuse import record_of, renew
 from chronoscene.registration.features.given import tasks as given_features
 from chronoscene.registration.features.sift import photos_at_once, sift_features
+from chronoscene.registration.work_folder import read_record
 
 BATCH = 64  # Photos
 
@@ -38,13 +42,11 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     Returns:
         ``keypoints``: number by name; ``focal_known``: whether the focal length of each camera is
-        known beforehand; ``carried``: number of photos with features from an earlier database;
-        ``absent``: photos that a given file lacks; ``remarks``.
+        known beforehand; ``absent``: photos that a given file lacks; ``remarks``.
     """
     quiet()
     database, photos, groups = (arguments[k] for k in ("database", "photos", "groups"))
-    create = partial(_import, database, photos, groups)
-    reused = renew(Path(database), record_of(arguments), create)
+    _prepare(Path(database), arguments)
     size = arguments["max_image_size"]
     extractor: Extractor = partial(
         sift_features, max_image_size=size, max_features=arguments["max_features"]
@@ -70,9 +72,38 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     return {
         "keypoints": {name: counts[name] for name in names},
         "focal_known": known,
-        "carried": reused,
         "absent": absent,
         "remarks": remarks,
+    }
+
+
+def _prepare(database: Path, arguments: Mapping[str, Any]) -> None:
+    """Make a new database with the images, unless there is one that was made for the same."""
+    record, wanted = database.with_suffix(".json"), _record(arguments)
+    if database.exists() and read_record(record) == wanted:
+        return
+    # SQLite ignores the journals without their database.
+    for path in (record, database, f"{database}-wal", f"{database}-shm"):
+        Path(path).unlink(missing_ok=True)
+    _import(str(database), arguments["photos"], arguments["groups"])
+    write_text_atomic(record, json.dumps(wanted))  # without one, a database is incomplete
+
+
+def _record(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all that features depend on, photos and masks by their SHA-256."""
+    folder, groups = Path(arguments["photos"]), arguments["groups"]
+    names = sorted(name for group in groups for name in group["names"])
+    masks = find_masks(folder.parent, names)
+    files = [[folder / name, *([masks[name]] if name in masks else [])] for name in names]
+    with ThreadPoolExecutor(arguments["threads"]) as pool:
+        digests = list(pool.map(lambda group: "".join(map(sha256_of, group)), files))
+    kept = ("max_image_size", "max_features", "given")
+    settings = {key: arguments[key] for key in kept if key in arguments}
+    made_by = {"method": METHOD, "pycolmap": pycolmap.__version__, "opencv": cv2.__version__}
+    return {
+        "settings": settings | made_by,
+        "groups": groups,
+        "photos": dict(zip(names, digests, strict=True)),
     }
 
 

@@ -60,8 +60,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     ``given`` (see `given.source.find_sources`; may be missing).
 
     Returns:
-        Number of ``pairs``, of those ``verified``, of their ``inliers``, and of the pairs
-        ``carried`` over from an earlier run.
+        Number of ``pairs``, of those ``verified``, and of their ``inliers``.
     """
     quiet()
     database = arguments["database"]
@@ -78,12 +77,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     report("pairs", len(pairs), len(pairs))
     with pycolmap.Database.open(database) as opened:
         counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
-    return {
-        "pairs": len(pairs),
-        "verified": sum(n > 0 for n in counts),
-        "inliers": sum(counts),
-        "carried": len(pairs) - len(left),
-    }
+    return {"pairs": len(pairs), "verified": sum(n > 0 for n in counts), "inliers": sum(counts)}
 
 
 def load_sift(opened: pycolmap.Database, image_id: int) -> Descriptors:

@@ -29,8 +29,9 @@ def test_matches_that_are_stored_are_verified_and_not_computed_again(tmp_path: P
         database.delete_two_view_geometry(*broken)
     write_pairs(tmp_path / "pairs.txt", pairs)
     arguments = {"database": path, "pairs": str(tmp_path / "pairs.txt"), "threads": 1}
-    found = match(arguments, lambda *progress: None)
-    assert (found["pairs"], found["verified"], found["carried"]) == (3, 3, 2)
+    done: list[int] = []
+    found = match(arguments, lambda what, number, total: done.append(number))
+    assert (found["pairs"], found["verified"], done[0]) == (3, 3, 2)
     with pycolmap.Database.open(path) as database:
         np.testing.assert_array_equal(database.read_matches(*broken), stored)
         after = database.read_two_view_geometry(*broken).inlier_matches
