@@ -88,6 +88,14 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 @pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Small scenes are quicker on one thread, most of all beside other work."""
+    runtime.set_threads(1)
+    yield
+    runtime.set_threads()
+
+
+@pytest.fixture
 def runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Benches in the test process."""
     from training_here import train_here

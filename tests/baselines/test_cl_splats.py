@@ -22,22 +22,15 @@ from baselines.cl_splats.model import LIVES, STRAYS
 from baselines.cl_splats.trainer import CLSplatsTrainer, by_period
 from chronoscene.errors import ConfigError
 from chronoscene.gaussians.model import SHAPES
-from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, build_config
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.checkpoint import load_tensors
 from chronoscene.training.drawing import Splats, draw
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 STEPS = 100
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Scenes this small are quicker on one thread, most of all beside other work."""
-    set_threads(1)
-    yield
-    set_threads()
 
 
 def config(**changes: Any) -> CLSplatsConfig:

@@ -21,16 +21,9 @@ from baselines.deformation_4dgs.model import find_box
 from baselines.deformation_4dgs.trainer import TwoStages
 from chronoscene.errors import ConfigError
 from chronoscene.gaussians.model import GaussianModel
-from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, build_config
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Scenes this small are quicker on one thread, most of all beside other work."""
-    set_threads(1)
-    yield
-    set_threads()
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def config(**changes: Any) -> Deformation4DGSConfig:

@@ -15,6 +15,8 @@ from chronoscene.errors import ShapeError
 from chronoscene.gaussians.model import SHAPES
 from chronoscene.kernels.runtime import set_threads
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 # Worst of 200 random problems against float64, relative to the largest number of a tensor (or to
 # `SMALL`, where sums cancel): values 1.3e-6, gradients 5.2e-6.
 VALUE_TOLERANCE = 5e-6
@@ -23,13 +25,6 @@ SMALL = 0.3
 
 ALL, SHAPE_ONLY = tuple(HEADS), tuple(HEADS)[:3]
 WEIGHTS = Weights(space=0.7, time=0.4, ones=0.2)
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    set_threads(1)
-    yield
-    set_threads()
 
 
 def make_field(**changes: Any) -> Field:

@@ -27,18 +27,11 @@ from baselines.gaussian_in_the_wild.trainer import WildTrainer, central_views
 from chronoscene.errors import ConfigError
 from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.train import painted_balls
-from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, View, build_config
 from chronoscene.training.photometric import photometric_loss_reference
 from chronoscene.training.views import PhotosOnDevice
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Scenes this small are quicker on one thread, most of all beside other work."""
-    set_threads(1)
-    yield
-    set_threads()
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def config(**changes: Any) -> GaussianInTheWildConfig:

@@ -14,13 +14,7 @@ from chronoscene.gaussians.trainer import Timeline
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Scenes this small are quicker on one thread, most of all beside other work."""
-    set_threads(1)
-    yield
-    set_threads()
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_it_learns_a_static_scene():

@@ -29,18 +29,11 @@ from baselines.realtime_4dgs.slicing import SHAPES, turned
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.gaussians.model import SHAPES as SPACE
 from chronoscene.gaussians.model import GaussianModel
-from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, build_config
 from chronoscene.training.checkpoint import load_tensors, save_tensors
 from chronoscene.training.drawing import draw
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Scenes this small are quicker on one thread, most of all beside other work."""
-    set_threads(1)
-    yield
-    set_threads()
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def config(**changes: Any) -> Realtime4DGSConfig:

@@ -15,19 +15,14 @@ from chronoscene.gaussians.model import axes_of, opacities_of
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.scene.geometry import rotation_from_quaternion
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 TIME, CYCLE = 0.4, 1.3
 
 # Worst of 120 random problems, relative to the largest number of a tensor or to 1, whichever is
 # larger: values 7.1e-7, gradients 1.1e-6.
 VALUE_TOLERANCE = 3e-6
 GRADIENT_TOLERANCE = 5e-6
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    set_threads(1)
-    yield
-    set_threads()
 
 
 def make_parameters(count: int, seed: int = 0) -> dict[str, Tensor]:

@@ -1,18 +1,13 @@
-"""Makes ``toy_scene`` importable."""
+"""Makes ``toy_scene`` importable; all tests here are on one thread."""
 
 import sys
 from pathlib import Path
 
 import pytest
 
-from chronoscene.kernels.runtime import set_threads
-
 sys.path.append(str(Path(__file__).parent / "support"))
 
 
 @pytest.fixture(autouse=True)
-def one_thread():
-    """Scenes this small are quicker on one thread, most of all beside other work."""
-    set_threads(1)
-    yield
-    set_threads()
+def quick(one_thread: None) -> None:
+    """Trainings here are of small scenes."""

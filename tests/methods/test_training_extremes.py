@@ -4,17 +4,11 @@ import extreme_trainings
 import numpy as np
 import pytest
 
-from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import load_spec, method_names
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 CHEAP = [e for e in extreme_trainings.EXTREMES[1:] if e.cheap]
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    set_threads(1)
-    yield
-    set_threads()
 
 
 SHARE = 9

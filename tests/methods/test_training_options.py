@@ -13,6 +13,8 @@ from chronoscene.methods import build_config, import_object, load_spec
 from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.views import downscale_view
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 STEPS = 30
 
 GAUSSIANS = ["4dgs", "realtime4dgs", "gs-w", "cl-splats"]
@@ -42,13 +44,6 @@ OPTIONS = [
     ("gs-w", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
 ]
 OPTIONS_IDS = [f"{method}-{'-'.join(options)}" for method, options in OPTIONS]
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    set_threads(1)
-    yield
-    set_threads()
 
 
 def start(name, data, **options):
