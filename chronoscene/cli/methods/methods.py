@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from textwrap import indent
 
 import click
 from rich.console import Console
 from rich.table import Table
 
-from chronoscene.cli.options import FOLDER, look_here_for
+from chronoscene.cli.options import look_here_for
 from chronoscene.cli.output import emit, say
 from chronoscene.errors import ConfigError
 from chronoscene.methods import (
@@ -28,24 +27,18 @@ from chronoscene.scene.grouping import grouped
 
 @click.command("methods")
 @click.argument("name", required=False)
-@click.option(
-    "--runs",
-    type=FOLDER,
-    default=Path("runs"),
-    help="Folder of finished runs, from which the costs of the method NAME are taken.",
-)
 @click.option("--all", "everything", is_flag=True, help="Show all options of the method NAME.")
-def command(name: str | None, runs: Path, everything: bool) -> None:
+def command(name: str | None, everything: bool) -> None:
     """List the installed methods, or describe one.
 
     For the method NAME (or module:SPEC), print the main options with their defaults, meaning and
-    values in the presets, and the costs of finished runs.
+    values in the presets.
     """
     if name is None:
         list_methods()
         return
     look_here_for([name])
-    emit("\n".join(describe(load_spec(name), runs, everything=everything)) + "\n")
+    emit("\n".join(describe(load_spec(name), everything=everything)) + "\n")
 
 
 def list_methods() -> None:
@@ -61,7 +54,7 @@ def list_methods() -> None:
     programs, others = _load(method_names(PROGRAM_GROUP))
     if programs:
         console.print(_program_table(programs.values()))
-    console.print("chronoscene methods NAME describes one: paper, licence, options, costs.")
+    console.print("chronoscene methods NAME describes one: paper, licence, options.")
     for error in (*broken, *others):
         say(f"left out: {error}", fg="yellow")
 
@@ -88,7 +81,7 @@ def _program_table(specs: Iterable[MethodSpec]) -> Table:
     return table
 
 
-def describe(spec: MethodSpec, runs: Path, *, everything: bool = True) -> Iterator[str]:
+def describe(spec: MethodSpec, *, everything: bool) -> Iterator[str]:
     """Yield the description of a method, line by line."""
     yield f"{spec.title} ({spec.name})"
     yield f"paper: {spec.paper}"
@@ -108,7 +101,6 @@ def describe(spec: MethodSpec, runs: Path, *, everything: bool = True) -> Iterat
         yield describe_option(option)
     if hidden := len(options) - len(shown):
         yield f"\n{hidden} more options: chronoscene methods {spec.name} --all"
-    yield f"\nCost:\n\n{describe_cost(spec, runs)}"
 
 
 def describe_option(option: Option) -> str:
@@ -117,21 +109,3 @@ def describe_option(option: Option) -> str:
     others = "".join(f"; {', '.join(names)}: {value}" for value, names in presets.items())
     text = click.wrap_text(option.meaning or "(no description)", width=80, initial_indent="")
     return f"{option.name}={as_typed(option.default)}{others}\n{indent(text, '    ')}"
-
-
-def describe_cost(spec: MethodSpec, runs: Path) -> str:
-    """Return the costs of finished runs; without any, the command that measures them."""
-    from chronoscene.harness.files.records import read_run, run_folders
-    from chronoscene.harness.report.tables import cost_tables
-    from chronoscene.io.tables import plain_text
-
-    records = [run for folder in run_folders(runs) if (run := read_run(folder)).method == spec.name]
-    if not records:
-        return (
-            f"No run of it in {runs}. Time and memory depend on scene, preset and machine:\n"
-            f"    chronoscene bench SCENE --method {spec.name} --preset balanced --out "
-            f"{shlex.quote(str(runs))}\n"
-            "measures them, and this command shows them then."
-        )
-    devices = dict.fromkeys(run.device for run in records)
-    return "\n".join([*map(plain_text, cost_tables(records)), f"measured on {'; '.join(devices)}"])

@@ -225,14 +225,6 @@ def readable_tables(
     return made
 
 
-def cost_tables(records: Sequence[RunRecord]) -> list[Table]:
-    """Make a table of the costs of runs for each scene."""
-    return [
-        _cost_table(part, str(scene))
-        for scene, part in summarise(records).groupby("scene", sort=False)
-    ]
-
-
 class _Column(NamedTuple):
     """A column of a table; a dash stands for labels without an entry."""
 
@@ -387,7 +379,7 @@ def _stage_tables(
     return [matrix, left] if every or len(ids) <= MAX_PERIODS else [left]
 
 
-def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str] = ()) -> Table:
+def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str]) -> Table:
     """Make the table of macro means and costs of the runs on one scene."""
     costs, macro = part[part.column == ""], part[part.column == "macro"]
     columns = [_Column(metric_info(m).title, macro[macro.quantity == m]) for m in metrics]

@@ -41,13 +41,12 @@ def test_every_option_has_a_meaning(name):
     assert [option.name for option in options_of(load_spec(name)) if not option.meaning] == []
 
 
-def test_a_description_has_defaults_presets_and_meanings(tmp_path):
-    text = methods("3dgs", "--runs", tmp_path)
+def test_a_description_has_defaults_presets_and_meanings():
+    text = methods("3dgs")
     assert text.startswith("3DGS (3dgs)\npaper: Kerbl et al., ")
     assert "\niterations=30000; accurate: 8000; balanced: 3000; fast: 1000\n    Training st" in text
     assert "\nstretch=" not in text and "more options: chronoscene methods 3dgs --all\n" in text
-    assert f"No run of it in {tmp_path}." in text
-    text = methods("3dgs", "--all", "--runs", tmp_path)
+    text = methods("3dgs", "--all")
     assert "\nstretch=false; accurate, balanced, fast: true\n    False: moment i is step i" in text
     assert "--all" not in text
 
@@ -59,16 +58,8 @@ def test_ten_options_come_first(name):
     assert first == list(spec.main_options) and len(first) == 10 and first[0] == "iterations"
 
 
-def test_finished_runs_say_what_a_method_costs(monkeypatch, tmp_path, make_scene_folder, runs_here):
-    monkeypatch.setitem(sys.modules, "toy_methods", None)
-    monkeypatch.delitem(sys.modules, "toy_methods")
+def test_a_method_of_the_current_folder(monkeypatch):
+    monkeypatch.delitem(sys.modules, "toy_methods", raising=False)
     monkeypatch.chdir(PLUGINS)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    scene = make_scene_folder({f"{p}/{i}.png": k for k, p in enumerate("ab") for i in range(3)})
-    runs = tmp_path / "runs"
-    bench = ["bench", str(scene), "--method", "toy_methods:MEAN", "--out", str(runs)]
-    assert CliRunner().invoke(cli, bench, catch_exceptions=False).exit_code == 0
-    text = methods("toy_methods:MEAN", "--runs", runs)
-    assert "rate=0.5\n    (no description)" in text
-    assert "Mean (joint, balanced) " in text and "peak memory [MB]" in text
-    assert "measured on cpu (" in text
+    assert "rate=0.5\n    (no description)" in methods("toy_methods:MEAN")
