@@ -27,6 +27,8 @@ from statistics import median
 import psutil
 
 from chronoscene.harness.files.provenance import processor_name
+from chronoscene.io.staging import staged_folder
+from chronoscene.statistics.counts import PAPER_COUNTS
 
 SCENE = "Aerial3"
 """The scene with the most points: 800 images, 530,434 points."""
@@ -118,13 +120,15 @@ def measure_command(name: str, arguments: Sequence[str]) -> Run:
 @contextmanager
 def skeletons(folder: Path | None) -> Iterator[Path]:
     """Folder of the skeletons, which are made where there are none yet."""
-    from benchmarks.data.skeletons.dataset import write_dataset
+    from benchmarks.data.skeletons.dataset import write_skeleton
 
     with tempfile.TemporaryDirectory() as temporary:
         data = folder or Path(temporary) / "skeletons"
         if not data.exists():
             start = time.perf_counter()
-            write_dataset(data)
+            with staged_folder(data) as staged:
+                for i, (name, counts) in enumerate(PAPER_COUNTS.items()):
+                    write_skeleton(staged / name, counts, seed=7919 * i)
             print(f"skeletons made in {time.perf_counter() - start:.1f} s")
         yield data
 

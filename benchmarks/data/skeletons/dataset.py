@@ -2,13 +2,12 @@
 
 A skeleton is a valid scene in the ChronoScene format: poses, points and tracks fit each other
 within a pixel. Its images are coloured noise of the cameras' size; nothing can be learnt from them.
-`write_dataset` makes all scenes of the paper's table of counts.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,101 +18,39 @@ from benchmarks.data.skeletons.geometry import flying_height, make_camera, make_
 from benchmarks.data.skeletons.tracks import Flight, add_noise, make_tracks
 from chronoscene.colmap.raw_model import RawPoints
 from chronoscene.colmap.write import posed_images, write_raw_model
-from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, WorldFrame
 from chronoscene.scene.splits import TEST_EVERY, format_split_text
-from chronoscene.statistics.counts import PAPER_COUNTS
 from chronoscene.synth.render.noise import rng_for
 
-Progress = Callable[[int, int, str], None]
-"""Called with scenes done, their total and the name of the one that comes."""
+SIZE = (64, 48)
+"""Width and height of cameras and images in pixels."""
 
 _NOISE_CELL = 4
 """Pixels along each side of a patch of one colour in an image."""
 
 
-def write_dataset(
-    out: Path,
-    *,
-    scenes: Sequence[str] | None = None,
-    seed: int = 0,
-    size: tuple[int, int] = (64, 48),
-    progress: Progress | None = None,
-) -> None:
-    """Write skeletons of the paper's scenes, one folder each.
-
-    Args:
-        out: New or empty folder.
-        scenes: Names in `PAPER_COUNTS`; None for all.
-        seed: Another seed is another place.
-        size: Width and height of cameras and images in pixels.
-        progress: Told about each scene.
-
-    Raises:
-        ConfigError: If a scene is unknown, or a size is out of range.
-        SceneError: If ``out`` is in use.
-    """
-    names = list(PAPER_COUNTS) if scenes is None else list(scenes)
-    for name in names:
-        if name not in PAPER_COUNTS:
-            raise ConfigError(
-                "--scene",
-                expected=f"one of {', '.join(PAPER_COUNTS)}",
-                found=repr(name),
-                todo="name scenes of the paper's table",
-            )
-    with staged_folder(out) as staged:
-        for done, name in enumerate(names):
-            if progress is not None:
-                progress(done, len(names), name)
-            place = seed + list(PAPER_COUNTS).index(name) * 7919
-            write_skeleton(staged / name, PAPER_COUNTS[name], seed=place, size=size)
-
-
-def write_skeleton(
-    out: Path, counts: Sequence[tuple[int, int]], *, seed: int = 0, size: tuple[int, int] = (64, 48)
-) -> None:
+def write_skeleton(out: Path, counts: Sequence[tuple[int, int]], *, seed: int = 0) -> None:
     """Write one scene.
 
     Args:
         out: New or empty folder.
-        counts: Images and points of each period; `chronoscene.statistics.count_scene` finds these.
+        counts: Images, three or more, and points of each period;
+            `chronoscene.statistics.count_scene` finds these.
         seed: Another seed is another place; equal arguments give equal bytes.
-        size: Width and height of cameras and images in pixels.
 
     Raises:
-        ConfigError: If there are too few images, or the size is out of range.
         SceneError: If ``out`` is in use.
     """
-    _check(counts, size)
-    camera = make_camera(*size)
+    camera = make_camera(*SIZE)
     with staged_folder(out) as staged:
         model = staged / scene_format.MODEL
         model.mkdir(parents=True)
         flights = _make_flights(camera, [images for images, _ in counts], seed)
         names = _write_texts(staged, counts)
         _write_model(model, camera, flights, names, counts, seed)
-        _write_images(staged / "images", names, size, seed)
-
-
-def _check(counts: Sequence[tuple[int, int]], size: tuple[int, int]) -> None:
-    least_images, sizes = 3, (16, 1024)
-    if not counts or any(images < least_images or points < 0 for images, points in counts):
-        raise ConfigError(
-            "counts of a skeleton",
-            expected=f"at least {least_images} images and no negative number of points per period",
-            found=str(list(counts)),
-            todo="ask for more images",
-        )
-    if not all(sizes[0] <= edge <= sizes[1] for edge in size):
-        raise ConfigError(
-            "--size",
-            expected=f"from {sizes[0]} to {sizes[1]} pixels for a skeleton",
-            found=f"{size[0]}x{size[1]}",
-            todo="choose a size in this range",
-        )
+        _write_images(staged / "images", names, seed)
 
 
 def _make_flights(camera: Camera, images: Sequence[int], seed: int) -> list[Flight]:
@@ -174,11 +111,11 @@ def _write_model(
     write_raw_model(folder, [camera], images, points)
 
 
-def _write_images(folder: Path, names: Sequence[str], size: tuple[int, int], seed: int) -> None:
+def _write_images(folder: Path, names: Sequence[str], seed: int) -> None:
     """Patches of random colours: small files, no two of them alike."""
     rng = rng_for(seed, "images")
     folder.mkdir()
-    cells = (-(-size[1] // _NOISE_CELL), -(-size[0] // _NOISE_CELL), 3)
+    cells = (SIZE[1] // _NOISE_CELL, SIZE[0] // _NOISE_CELL, 3)
     for name in names:
         patches = Image.fromarray(rng.integers(0, 256, cells, dtype=np.uint8))
-        patches.resize(size, Image.Resampling.NEAREST).save(folder / name, quality=80)
+        patches.resize(SIZE, Image.Resampling.NEAREST).save(folder / name, quality=80)

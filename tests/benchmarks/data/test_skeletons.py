@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.data.skeletons.dataset import write_dataset, write_skeleton
+from benchmarks.data.skeletons.dataset import write_skeleton
 from benchmarks.data.skeletons.tracks import LARGEST_RESIDUAL, LEAST_TRACK
-from chronoscene.errors import ConfigError, SceneError
+from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.decoding import load_rgb
 from chronoscene.scene import Scene
@@ -95,21 +95,9 @@ def test_equal_arguments_give_equal_bytes(folder: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("counts", [[(3, 40)], [(3, 5), (3, 0)], [(4, 30)] * 9])
 def test_extremes(tmp_path: Path, counts: list[tuple[int, int]]) -> None:
-    write_skeleton(tmp_path / "s", counts, size=(16, 16))
+    write_skeleton(tmp_path / "s", counts)
     counted = count_scene(read_scene(tmp_path / "s"))
     assert [(p.images, p.points) for p in counted.periods] == counts
-
-
-@pytest.mark.parametrize(
-    ("counts", "size"), [([], (64, 48)), ([(2, 10)], (64, 48)), ([(5, -1)], (64, 48)),
-                         ([(5, 10)], (8, 48)), ([(5, 10)], (64, 5000))]
-)  # fmt: skip
-def test_bad_arguments(
-    tmp_path: Path, counts: list[tuple[int, int]], size: tuple[int, int]
-) -> None:
-    with pytest.raises(ConfigError):
-        write_skeleton(tmp_path / "s", counts, size=size)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_in_use_stays_as_it_is(tmp_path: Path) -> None:
@@ -136,17 +124,3 @@ def test_counts_of_the_paper_add_up() -> None:
         sums[4] += np.sum(periods, axis=0)
     assert [tuple(row) for row in sums.tolist()] == list(PAPER_TOTALS)
     assert sum(map(len, PAPER_COUNTS.values())) == 42
-
-
-def test_a_scene_of_the_paper(tmp_path: Path) -> None:
-    out = tmp_path / "set"
-    write_dataset(out, scenes=["Lawncourt"], size=(32, 24))
-    assert [p.name for p in out.iterdir()] == ["Lawncourt"]
-    counted = count_scene(read_scene(out / "Lawncourt"))
-    assert tuple((p.images, p.points) for p in counted.periods) == PAPER_COUNTS["Lawncourt"]
-
-
-def test_an_unknown_scene_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        write_dataset(tmp_path / "x", scenes=["Lawncourt", "nowhere"])
-    assert list(tmp_path.iterdir()) == []
