@@ -50,8 +50,6 @@ METHOD = "chronogs"
 PAGE_BYTES = 25e6
 """Limit of the page to walk through: the default of ``chronoscene page``."""
 
-Words = list[str | Path]
-
 
 class Skipped(Exception):  # noqa: N818  (no error: the other steps go on)
     """Reason why a step cannot be done with these photos, or with this installation."""

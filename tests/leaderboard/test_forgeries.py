@@ -185,7 +185,6 @@ def in_place(make):
     return forge
 
 
-FAST = "3dgs", "fast"
 FORGERIES = {
     # Values
     "40 dB and hashes of zeros": (
