@@ -429,8 +429,12 @@ def footnotes(
             "unknown and not in it"
         )
     if entries.tied.any():
-        of_periods = entries[entries.tied & entries.column.str.startswith("period ")]
-        fewest = min(map(len, of_periods.views), default=FEW_VIEWS)
+        tied = entries[entries.tied]
+        counts = [
+            sum(column == f"period {period}" for _, period, _ in views)
+            for column, views in zip(tied.column, tied.views, strict=True)
+        ]
+        fewest = min(filter(None, counts), default=FEW_VIEWS)
         notes.append(
             "†: at 95 %, not separated from the best of its column, which was chosen among all"
             + (f"; {fewest} test views of a period separate little" * (fewest < FEW_VIEWS))
