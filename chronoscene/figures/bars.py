@@ -11,6 +11,7 @@ from chronoscene.statistics.counts import SceneCount, period_title
 
 BAR = 0.3  # Inches per scene
 WIDTH = 9.0
+LINE = 0.24  # Inches per line of the legend
 MAX_LEGEND_ENTRIES = 12  # Periods up to which each has an entry
 
 
@@ -27,18 +28,22 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
     colors = canvas.period_colors(periods)
     names = [canvas.short_name(c.name) for c in counts]
     longest = max(map(cell_len, names))
-    left, top, bottom = 0.25 + 0.075 * longest, 0.42, 0.5
-    height = top + bottom + BAR * (len(counts) + 0.4)
-    figure = canvas.new_figure(WIDTH, height)
-    gap = 0.35
-    width = (WIDTH - left - gap - 0.2) / 2
     seen = any(c.count == "seen" for c in counts)
-    legend = _period_names(counts, periods)
+    legend = list(zip(_period_names(counts, periods), colors, strict=True))
+    legend = legend[:: -(-periods // MAX_LEGEND_ENTRIES)]
     points = [[p.points for p in c.periods] for c in counts]
     if any(c.points_without_period for c in counts):
         for row, c in zip(points, counts, strict=True):
             row += [0] * (periods - len(row)) + [c.points_without_period]
-        legend, colors = [*legend, canvas.UNSEEN], [*colors, canvas.UNSEEN_COLOR]
+        legend.append((canvas.UNSEEN, canvas.UNSEEN_COLOR))
+        colors = [*colors, canvas.UNSEEN_COLOR]
+    columns = max(1, int((WIDTH - 0.3) / (0.45 + 0.075 * max(len(name) for name, _ in legend))))
+    left, bottom = 0.25 + 0.075 * longest, 0.5
+    top = 0.18 + LINE * -(-len(legend) // columns)
+    height = top + bottom + BAR * (len(counts) + 0.4)
+    figure = canvas.new_figure(WIDTH, height)
+    gap = 0.35
+    width = (WIDTH - left - gap - 0.2) / 2
     kinds = (
         ("images", [[p.images for p in c.periods] for c in counts]),
         ("points, again in each period" if seen else "points", points),
@@ -49,7 +54,8 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
         _draw_panel(axes, what, values, colors)
         axes.set_yticks(range(len(counts)), [] if i else map(canvas.plain, names))
         axes.tick_params(axis="y", length=0, labelsize=9)
-    _legend(figure, legend, colors, 1 - 0.1 / height)
+    place = (0.5, 1 - 0.1 / height)
+    canvas.add_legend(figure, legend, columns, loc="upper center", bbox_to_anchor=place)
     canvas.save(figure, path)
 
 
@@ -102,11 +108,3 @@ def _period_names(counts: Sequence[SceneCount], periods: int) -> list[str]:
     if all(name == str(i) for i, name in enumerate(names)):
         return [f"Period {i}" if i == 0 or periods < 7 else str(i) for i in range(periods)]
     return [canvas.short_name(name) for name in names]
-
-
-def _legend(figure: Any, names: Sequence[str], colors: Sequence[str], top: float) -> None:
-    """Draw the names of the periods above the panels; of many only some."""
-    fitting = int((WIDTH - 0.3) / (0.45 + 0.075 * max(map(len, names))))
-    step = -(-len(colors) // min(MAX_LEGEND_ENTRIES, max(fitting, 1)))
-    entries = list(zip(names, colors, strict=True))[::step]
-    canvas.add_legend(figure, entries, len(entries), loc="upper center", bbox_to_anchor=(0.5, top))

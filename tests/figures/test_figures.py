@@ -354,6 +354,22 @@ def test_the_legend_of_the_bars_has_names_that_all_scenes_share():
     assert _period_names([named, one], 2) == ["Period 0", "Period 1"]
 
 
+def test_periods_of_the_bars_that_can_be_told_apart_are_all_in_the_legend(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr("chronoscene.figures.canvas.save", lambda figure, path: kept.append(figure))
+    one = counted("a", [(3, 50)] * 8)
+    named = replace(
+        one, periods=tuple(replace(p, label=f"autumn morning {p.id}") for p in one.periods)
+    )
+    draw_bars([named, counted("b", [(3, 50)])], tmp_path / "x.png")
+    (figure,) = kept
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == 8
+    box = legend.get_window_extent()
+    assert box.x0 > 0 and box.y0 > figure.axes[0].get_window_extent().y1
+
+
 @pytest.mark.parametrize("rows", [[(1, 0)], [(0, 0)] * 2, [(2, 30)] * 50])
 def test_bars_of_extreme_scenes(tmp_path, rows):
     draw_bars([counted("n" * 200, rows)], tmp_path / "x.png")
