@@ -257,7 +257,8 @@ def bench(
         overwrite: Replace finished runs and unfinished trainings that have other settings.
         format: Name of the dataset format of the scenes; None to detect it.
         period_by: Grouping of images into periods, for formats with a choice.
-        log: Function that takes lines about the progress; None for silence.
+        log: Function that takes a line about each step of the plan; None for none. The progress of
+            each training goes to standard error in any case.
 
     Raises:
         ChronoSceneError: If anything asked for is wrong; nothing is trained then. Failures during

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -95,7 +96,8 @@ def command(
         return
     curves = [whole_curve(read_curve(run.folder), run.strategy) for run in records]
     points, times = front_points(records), curve_values(records, curves)
-    notes = footnotes(summarise(records).assign(tied=False), records, failures)
+    entries = summarise(records).assign(tied=False, difference_low=math.nan)  # neither is shown
+    notes = footnotes(entries, records, failures, macro_only=True)
     emit(_text(points, times, notes, style, out), out)
     if len(points):
         figure = (figures or folders[0] / FIGURES) / FIGURE

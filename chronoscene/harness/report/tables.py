@@ -409,14 +409,21 @@ def footnotes(
     records: Sequence[RunRecord],
     failures: Sequence[Failure],
     wanted: Sequence[str] = (),
+    *,
+    macro_only: bool = False,
 ) -> list[str]:
-    """List the notes below tables: aggregates, spread, device, code, absent values and reasons."""
-    many = any(len(run.periods) > MAX_PERIODS for run in records)
-    known = [f"{a.name}: {a.meaning}" for a in AGGREGATES if many or not a.for_many_periods]
+    """List the notes below tables: aggregates, spread, device, code, absent values and reasons.
+
+    With ``macro_only``, the tables have neither other aggregates, nor intervals of the means, nor
+    what periods share.
+    """
+    many = not macro_only and any(len(run.periods) > MAX_PERIODS for run in records)
+    aggregates = AGGREGATES[:1] if macro_only else AGGREGATES
+    known = [f"{a.name}: {a.meaning}" for a in aggregates if many or not a.for_many_periods]
     notes = ["; ".join(known) + ("; --periods shows every period" if many else "")]
     if (entries.n > 1).any():
         notes.append("±: sample standard deviation over n seeds")
-    if entries.low.notna().any():
+    if entries.low.notna().any() and not macro_only:
         notes.append(
             "[ ]: 95 % interval of macro over test views, by a bootstrap of blocks of neighbours "
             "in each period; seeds are averaged before"
@@ -453,7 +460,8 @@ def footnotes(
         said = "; ".join(f"{effort}: {names}" for effort, names in efforts)
         notes.append(f"efforts differ, and a difference may be theirs: {said}")
     counted = [(r.primitive, r.title) for r in records if r.primitives is not None and not wanted]
-    if entries.quantity.isin([cost.name for cost in SHARING]).any() and not wanted:
+    shared = entries.quantity.isin([cost.name for cost in SHARING]).any()
+    if shared and not wanted and not macro_only:
         notes.append(
             "invariant: primitives with one block of features for all periods; blocks each: mean "
             "over primitives; numbers: those stored for one period alone, mean over periods"

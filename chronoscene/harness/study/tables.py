@@ -228,7 +228,7 @@ def study_texts(
         *study.notes,
     ]
     measured = entries[entries.source == MEASURED].assign(tied=False)
-    notes += footnotes(measured, records, failures)
+    notes += footnotes(measured, records, failures, macro_only=True)
     listed = entries[[*COLUMNS]]
     document = {
         "title": study.title,

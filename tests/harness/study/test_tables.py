@@ -132,6 +132,8 @@ def test_every_format_has_measured_and_published_figures(runs, tmp_path):
     for text in (texts["markdown"], texts["table"]):
         assert "published: A paper, table 3" in text and "parts are left out one by one" in text
         assert "plaza, without a: in PSNR [dB] the direction agrees" in text.replace("\\", "")
+        assert "macro: mean over periods\n" in text  # and nothing of what only `table` shows
+        assert "95 % interval of macro" not in text
 
     entries = json.loads(texts["json"])["entries"]
     by_key = {(e["source"], e["row"], e["quantity"]): e for e in entries}
