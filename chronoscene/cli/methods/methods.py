@@ -38,7 +38,7 @@ def command(name: str | None, everything: bool) -> None:
         list_methods()
         return
     look_here_for([name])
-    emit("\n".join(describe(load_spec(name), everything=everything)) + "\n")
+    emit("\n".join(describe(name, everything=everything)) + "\n")
 
 
 def list_methods() -> None:
@@ -81,8 +81,9 @@ def _program_table(specs: Iterable[MethodSpec]) -> Table:
     return table
 
 
-def describe(spec: MethodSpec, *, everything: bool) -> Iterator[str]:
-    """Yield the description of a method, line by line."""
+def describe(name: str, *, everything: bool) -> Iterator[str]:
+    """Yield the description of a method, by its name or ``module:SPEC``, line by line."""
+    spec = load_spec(name)
     yield f"{spec.title} ({spec.name})"
     yield f"paper: {spec.paper}"
     yield f"licence: {spec.licence}"
@@ -100,7 +101,7 @@ def describe(spec: MethodSpec, *, everything: bool) -> Iterator[str]:
     for option in shown:
         yield describe_option(option)
     if hidden := len(options) - len(shown):
-        yield f"\n{hidden} more options: chronoscene methods {spec.name} --all"
+        yield f"\n{hidden} more options: chronoscene methods {name} --all"
 
 
 def describe_option(option: Option) -> str:

@@ -51,6 +51,11 @@ def test_a_description_has_defaults_presets_and_meanings():
     assert "--all" not in text
 
 
+def test_commands_name_a_method_that_is_not_installed_by_its_module():
+    name = "baselines.gaussian_splatting:SPEC"
+    assert f"more options: chronoscene methods {name} --all\n" in methods(name)
+
+
 @pytest.mark.parametrize("name", method_names())
 def test_ten_options_come_first(name):
     spec = load_spec(name)
