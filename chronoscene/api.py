@@ -268,11 +268,16 @@ def bench(
         >>> result = bench("data/plaza", ["chronogs", "3dgs"], out="runs", budget="90s")
         >>> result.table(["psnr"])
     """
-    if isinstance(seeds, int):
+    if isinstance(seeds, int | str):
         raise ConfigError(
             "seeds", expected="seeds such as [0] or range(3)", found=repr(seeds), todo="list them"
         )
-    folders = [Path(scene) for scene in ([scenes] if isinstance(scenes, str | Path) else scenes)]
+    scenes = [scenes] if isinstance(scenes, str | Path | Scene) else scenes
+    for scene in scenes:
+        if isinstance(scene, Scene):
+            todo = f"name {scene.root}, with format and period_by if it was read with these"
+            raise ConfigError("scenes", expected="folders", found="a Scene", todo=todo)
+    folders = [Path(scene) for scene in scenes]
     methods, seeds = _several(methods), tuple(seeds)
     for name, given in (("scenes", folders), ("methods", methods), ("seeds", seeds)):
         if not given:

@@ -150,6 +150,7 @@ def test_validate_wants_one_scene(in_folder):
         ({"seeds": (2**64,)}, "--seed: expected seeds from 0 to .*, found 18446744073709551616;"),
         ({"seeds": (1.5,)}, r"--seed: expected seeds from 0 to 2\^64 - 1, found 1.5;"),
         ({"seeds": 3}, r"seeds: expected seeds such as \[0\] or range\(3\), found 3;"),
+        ({"seeds": "0"}, r"seeds: expected seeds such as \[0\] or range\(3\), found '0';"),
         ({"seeds": ()}, "seeds: expected at least one, found none;"),
         ({"methods": []}, "methods: expected at least one, found none;"),
         ({"scenes": []}, "scenes: expected at least one, found none;"),
@@ -169,6 +170,11 @@ def test_bench_refuses_before_it_trains(in_folder, wrong, message):
     with pytest.raises(cs.ChronoSceneError, match=message):
         cs.bench(**right | wrong)
     assert not list(Path().glob("runs/plaza/*"))
+
+
+def test_bench_wants_folders_and_says_so_of_a_scene(in_folder):
+    with pytest.raises(cs.ChronoSceneError, match="scenes: expected folders, found a Scene; name "):
+        cs.bench(cs.read_scene(in_folder), "chronogs", out="runs")
 
 
 def test_rows_keep_names_of_digits_and_have_their_columns_without_runs(tmp_path):
