@@ -37,11 +37,11 @@ def test_periods_by_an_option_are_verified(project, tmp_path):
     verify = ("--verify", project, "--period-by", f"table:{table}", "--out")
     done = run_command("leaderboard", tmp_path / "entries", *verify, tmp_path / "site")
     assert done.exit_code == 0 and NO_ENTRY not in done.stderr
-    assert done.stdout.startswith("1 measured entries: 1 verified, 0 claimed")
+    assert done.stdout.startswith("measured entries: 1; verified: 1; claimed: 0;")
     table.write_text(table.read_text().replace("0.png,0", "0.png,1"))
     done = run_command("leaderboard", tmp_path / "entries", *verify, tmp_path / "another")
     assert done.exit_code == 0 and f"{project}: {NO_ENTRY}" in done.stderr
-    assert done.stdout.startswith("1 measured entries: 0 verified, 1 claimed")
+    assert done.stdout.startswith("measured entries: 1; verified: 0; claimed: 1;")
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_a_view_whose_mask_ignores_every_pixel_has_no_values(project, hidden, tm
     rule = ("--period-by", f"table:{tmp_path}/periods.csv")
     site = (path.parents[1], "--verify", project, *rule, "--out", tmp_path / "site")
     done = run_command("leaderboard", *site)
-    assert done.stdout.startswith("1 measured entries: 1 verified, 0 claimed"), done.output
+    assert done.stdout.startswith("measured entries: 1; verified: 1; claimed: 0;"), done.output
 
 
 @pytest.mark.parametrize("forgery", ["values of the hidden view", "no values of another one"])

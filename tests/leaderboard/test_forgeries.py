@@ -396,7 +396,7 @@ def test_the_site_is_built_whatever_lies_among_the_entries(honest, forger, place
     arguments = ["leaderboard", place, "--verify", honest / "yard", "--out", site]
     done = CliRunner().invoke(cli, [*map(str, arguments)], catch_exceptions=False)
     assert done.exit_code == 0
-    assert done.stdout.startswith("2 measured entries: 1 verified, 1 claimed, ")
+    assert done.stdout.startswith("measured entries: 2; verified: 1; claimed: 1;")
     assert f"claimed: 1: {NO_IMAGES}\n" in done.stdout
     assert done.stderr.count("left out: ") == 6
     text = (site / "scene/yard.html").read_text()
