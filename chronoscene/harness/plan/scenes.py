@@ -47,14 +47,14 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
         )
         if scene.name in scenes:
             other = scenes[scene.name][0].root
-            twice = other.samefile(scene.root)
+            if other.samefile(scene.root):
+                todo = "name it once"
+                raise ConfigError(other, expected="each scene once", found="it twice", todo=todo)
             raise ConfigError(
                 scene.root,
-                expected="each scene once" if twice else "a scene with a unique name",
-                found="it twice" if twice else f"{scene.name!r}, the name of {other} too",
-                todo="name it once"
-                if twice
-                else "rename a folder, or run the scenes with different --out",
+                expected="a scene with a unique name",
+                found=f"{scene.name!r}, the name of {other} too",
+                todo="rename a folder, or run the scenes with different --out",
             )
         check_not_among_runs(scene, settings.run.runs)
         check_scene(scene)
