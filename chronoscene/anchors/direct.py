@@ -18,7 +18,7 @@ from chronoscene.anchors.decode.function import Job
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.methods import TrainingView
 from chronoscene.rasterizer import RasterInfo
-from chronoscene.rasterizer.cpu import DirectRender
+from chronoscene.rasterizer.cpu import DirectRender, expected_depth
 from chronoscene.rasterizer.cpu.layout import LANES
 from chronoscene.rasterizer.inputs import Inputs, check_settings
 from chronoscene.training import devices
@@ -31,6 +31,7 @@ from chronoscene.training.drawing import (
 )
 from chronoscene.training.losses import add_mean_volume
 from chronoscene.training.photometric import loss_and_gradient
+from chronoscene.training.sparse_depth import DepthTarget
 
 _SCALES, _OPACITIES = (Splats._fields.index(name) for name in ("scales", "opacities"))
 
@@ -56,6 +57,7 @@ def learn_directly(
     background: Tensor,
     config: AnchorConfig,
     chance: Chance,
+    target: DepthTarget | None,
 ) -> DirectPass | None:
     """Draw a view, compare it with its photo, and go back to the tensors of the model.
 
@@ -67,6 +69,7 @@ def learn_directly(
         background: The usual colour behind everything. [3]
         config: Options of drawing and loss.
         chance: Decides on what is random.
+        target: Depths to compare with; None where the step has no such term.
 
     Returns:
         None where autograd has to do it: the kernels do not run on the device, the model gives its
@@ -85,9 +88,14 @@ def learn_directly(
     if factors is not None:
         drawn = splats._replace(opacities=splats.opacities * factors)
     background = step_background(background, config, chance)
-    render = DirectRender(_raster_inputs(drawn, view, background, config))
+    with_depth = target is not None
+    render = DirectRender(_raster_inputs(drawn, view, background, config, with_depth))
     loss, image_gradient = loss_and_gradient(render.image, photo, ssim_weight=config.ssim_weight)
-    grads = render.backward(image_gradient)
+    depth_gradients: tuple[Tensor, ...] = ()
+    if target is not None:
+        term, depth_gradients = _depth_term(render, target)
+        loss = loss + term
+    grads = render.backward(image_gradient, *depth_gradients)
     if factors is not None:
         grads[_OPACITIES].mul_(factors)
     if config.scale_weight:
@@ -98,6 +106,15 @@ def learn_directly(
         if tensor.is_leaf:
             tensor.grad = gradient
     return DirectPass(loss, outputs[1], splats, render.info)
+
+
+def _depth_term(render: DirectRender, target: DepthTarget) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Return the term of the loss, and its gradients in opacity and weighted depth."""
+    assert render.weighted is not None
+    drawn = render.alpha.requires_grad_(), render.weighted.requires_grad_()
+    with torch.enable_grad():
+        term = target.term(expected_depth(render.weighted, render.alpha))
+    return term.detach(), torch.autograd.grad(term, drawn)
 
 
 def _is_plain(seen: AnchorModel, inputs: DecodeInputs) -> bool:
@@ -118,7 +135,7 @@ def _trained(inputs: DecodeInputs) -> list[Tensor]:
 
 
 def _raster_inputs(
-    splats: Splats, view: TrainingView, background: Tensor, config: AnchorConfig
+    splats: Splats, view: TrainingView, background: Tensor, config: AnchorConfig, render_depth: bool
 ) -> Inputs:
     """Return what `draw_in_training` has rasterized."""
     inputs = Inputs(
@@ -128,6 +145,7 @@ def _raster_inputs(
         height=view.height,
         near_plane=config.near_plane,
         backgrounds=background[None],
+        render_depth=render_depth,
         absgrad=config.absgrad,
         antialiased=config.antialiased,
     )

@@ -33,6 +33,7 @@ from chronoscene.training.losses import mean_volume, training_loss
 from chronoscene.training.optimizers.adam import Pace
 from chronoscene.training.optimizers.summing import Part
 from chronoscene.training.schedules import learning_rates
+from chronoscene.training.sparse_depth import DepthTarget, SparseDepth
 from chronoscene.training.views import (
     PhotosOnDevice,
     ViewSampler,
@@ -60,6 +61,8 @@ class Drawn(NamedTuple):
     """uint8 [H, W, 3]"""
     mask: Tensor | None
     """bool [H, W]"""
+    target: DepthTarget | None
+    """Depths to compare with."""
 
 
 class ViewPass(NamedTuple):
@@ -115,6 +118,7 @@ class AnchorTrainer:
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed, train.expect)
         self.photos = PhotosOnDevice(train, model.device)
+        self.sparse_depth = SparseDepth(self.config.depth_weight, train, model.device)
         self.exposure = Exposure(self.config.exposure, train, model.device, Pace(self.views))
 
     def step(self, index: int, progress: float) -> StepReport:
@@ -175,7 +179,9 @@ class AnchorTrainer:
         """Draw the next view and load its photo; arguments as in `step`."""
         number = self.sampler.next()
         photo, mask = self.photos.photo(number), self.photos.mask(number)
-        return Drawn(number, Chance(self.seed, self.sampler.drawn, progress), photo, mask)
+        drawn = self.sampler.drawn
+        target = self.sparse_depth.target(number, drawn)
+        return Drawn(number, Chance(self.seed, drawn, progress), photo, mask, target)
 
     def _learn(self, due: Drawn) -> ViewPass:
         """Draw a training view and collect gradients; the model and its optimiser stay."""
@@ -204,7 +210,7 @@ class AnchorTrainer:
         with torch.no_grad():
             inputs = seen.model.decode_inputs(*self._decode_arguments(seen.model, view))
         found = learn_directly(
-            seen.model, inputs, view, due.photo, self.background, config, due.chance
+            seen.model, inputs, view, due.photo, self.background, config, due.chance, due.target
         )
         if found is None:
             return None
@@ -214,10 +220,15 @@ class AnchorTrainer:
     def _learn_by_autograd(self, seen: SeenAnchors, due: Drawn) -> Learned:
         config, view = self.config, self.train.views[due.number]
         splats, positions = seen.model.decode_active(*self._decode_arguments(seen.model, view))
-        raster = draw_in_training(splats, view, self.background, config, due.chance)
+        target = due.target
+        raster = draw_in_training(
+            splats, view, self.background, config, due.chance, render_depth=target is not None
+        )
         loss = training_loss(
             raster, due.photo, due.mask, number=due.number, exposure=self.exposure, config=config
         )
+        if target is not None and raster.depths is not None:
+            loss = loss + target.term(raster.depths[0])
         if config.scale_weight:
             loss = loss + config.scale_weight * mean_volume(splats.scales, splats.opacities)
         result = collect_gradients(

@@ -33,6 +33,7 @@ from chronoscene.training.optimizers.adam import Adam, Pace
 from chronoscene.training.optimizers.summing import Part, add_gradients
 from chronoscene.training.photometric import photometric_loss
 from chronoscene.training.schedules import cooled, log_linear
+from chronoscene.training.sparse_depth import SparseDepth
 from chronoscene.training.views import (
     PhotosOnDevice,
     ViewSampler,
@@ -140,6 +141,7 @@ class GaussianTrainer:
         device = self.background.device
         self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
         self.photos = PhotosOnDevice(self.train, device)
+        self.sparse_depth = SparseDepth(self.config.depth_weight, self.train, device)
         self.exposure = Exposure(self.config.exposure, self.train, device, self.pace)
 
     def begin(self) -> None:
@@ -185,11 +187,17 @@ class GaussianTrainer:
         view = self.train.views[number]
         splats = self.splats(number)
         chance = Chance(self.seed, self.sampler.drawn, due.progress)
-        raster = draw_in_training(splats, view, self.background, self.config, chance)
+        target = self.sparse_depth.target(number, self.sampler.drawn)
+        raster = draw_in_training(
+            splats, view, self.background, self.config, chance, render_depth=target is not None
+        )
         mask = self.photos.mask(number)
+        terms = self._regulariser(splats)
+        if target is not None and raster.depths is not None:
+            terms = terms + target.term(raster.depths[0])
         self.optimizer.zero_grad()
         result = collect_gradients(
-            self.loss(raster, number, mask) + self._regulariser(splats),
+            self.loss(raster, number, mask) + terms,
             raster.info,
             lambda: self.optimizer.gradients() | self.exposure.gradients(),
             mask,

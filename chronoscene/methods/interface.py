@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,20 @@ def nothing_ahead(indices: Sequence[int]) -> None:
     """`TrainingSet.expect` of sets whose images are at hand."""
 
 
+class SparseDepths(NamedTuple):
+    """Depths of sparse points in a view, of one point in a pixel."""
+
+    pixels: NDArray[np.int64]
+    """Row times width of the view plus column, ascending. [S]"""
+    depths: NDArray[np.float32]
+    """z-depth in units of the training frame. [S]"""
+
+
+def no_depths(index: int) -> SparseDepths:
+    """`TrainingSet.load_depths` of sets whose points have no observations."""
+    return SparseDepths(np.zeros(0, np.int64), np.zeros(0, np.float32))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingSet:
     """Data that a method may learn from, in the normalised training frame.
@@ -80,6 +94,9 @@ class TrainingSet:
     load_mask: Callable[[int], NDArray[np.bool_] | None] = no_mask
     """Pixels of ``views[i]`` that count; None if all do. The others must not change the model.
     [H, W]"""
+    load_depths: Callable[[int], SparseDepths] = no_depths
+    """Depths of the sparse points that the image of ``views[i]`` observes, as at least two others
+    do, where its mask counts."""
     expect: Callable[[Sequence[int]], None] = nothing_ahead
     """Function to call with the views whose images will be loaded next, in their order: they are
     decoded while the method does something else. A method that never calls it waits for each

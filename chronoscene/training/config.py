@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
@@ -32,6 +32,10 @@ class SplattingConfig:
     trained on (Yu et al. 2024, Mip-Splatting)."""
     ssim_weight: Annotated[float, Field(ge=0, le=1)] = 0.2
     """Weight of 1 - SSIM in the loss; L1 gets the rest."""
+    depth_weight: NonNegativeFloat = 0.0
+    """Weight, in the loss, of the mean relative deviation of the depth from that of the sparse
+    points which the photo observes (Deng et al. 2022, DS-NeRF): surfaces are then where the points
+    are. Without it, a model may show lawns, roads or roofs with little texture metres too low."""
     absgrad: bool = False
     """Add Gaussians where the sum over the pixels of a centre's absolute gradients is large, which
     does not cancel where a Gaussian is too large for what it shows (Ye et al. 2024, AbsGS). It is
@@ -57,6 +61,13 @@ class SplattingConfig:
     def __post_init__(self) -> None:
         check_options(self)
         check_choice("length_unit", self.length_unit, ("world", "training"))
+        if self.absgrad and self.depth_weight:
+            raise ConfigError(
+                "absgrad",
+                expected="False with depth_weight",
+                found="True",
+                todo="set absgrad=false, or depth_weight=0",
+            )
         for place, rate in self._falling_rates().items():
             if min(rate) < 0 or (0 in rate and any(rate)):
                 raise ConfigError(

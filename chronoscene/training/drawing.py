@@ -136,12 +136,15 @@ def opacity_factors(opacities: Tensor, config: SplattingConfig, chance: Chance) 
 
 
 def draw_in_training(
-    splats: Splats, view: View, background: Tensor, config: SplattingConfig, chance: Chance
+    splats: Splats,
+    view: View,
+    background: Tensor,
+    config: SplattingConfig,
+    chance: Chance,
+    *,
+    render_depth: bool = False,
 ) -> Rasterization:
-    """Draw a view in a training step, as the options ask for; arguments as `step_background`.
-
-    Both trainers draw by it: what a term of the loss needs, such as depth, is asked for here.
-    """
+    """Draw a view in a training step, as the options ask for; arguments as `step_background`."""
     factors = opacity_factors(splats.opacities, config, chance)
     if factors is not None:
         splats = splats._replace(opacities=splats.opacities * factors)
@@ -152,6 +155,7 @@ def draw_in_training(
         near_plane=config.near_plane,
         antialiased=config.antialiased,
         absgrad=config.absgrad,
+        render_depth=render_depth,
         # What is not finite shows in the gradients; one such step ends no training.
         check_finite=False,
     )

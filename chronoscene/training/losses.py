@@ -40,8 +40,8 @@ def training_loss(
 ) -> Tensor:
     """Compute the loss that all methods share, for one training view.
 
-    A term for all methods is added here, and its weight as an option of `SplattingConfig`; a depth
-    to compare is asked for in `chronoscene.training.drawing.draw_in_training`.
+    A term of image and photo for all methods is added here, and its weight as an option of
+    `SplattingConfig`; that of depth is in `chronoscene.training.sparse_depth`.
 
     Args:
         raster: The view as it was drawn.

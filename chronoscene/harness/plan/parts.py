@@ -12,6 +12,7 @@ from chronoscene.arrays import Array, Mask
 from chronoscene.checks import check_choice
 from chronoscene.errors import SceneError
 from chronoscene.harness.files.strategies import STRATEGIES, period_part
+from chronoscene.harness.plan.sparse_depths import depth_loader
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import MethodSpec, TrainingSet, TrainingView, View
 from chronoscene.scene import Frame, Scene
@@ -264,6 +265,7 @@ def _training_set(
         background=np.zeros(3, np.float32),
         load_image=lambda i: store.load(frames[i]),
         load_mask=lambda i: store.load_mask(frames[i]),
+        load_depths=depth_loader(scene, frames, store, to_training.scale),
         expect=lambda indices: store.expect([frames[i] for i in indices]),
     )
 

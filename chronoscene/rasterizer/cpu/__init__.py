@@ -24,7 +24,7 @@ from chronoscene.rasterizer.cpu.passes import Gaussians, Rendering
 from chronoscene.rasterizer.cpu.project import set_colors
 from chronoscene.rasterizer.inputs import Inputs, recentred
 
-__all__ = ["DirectRender", "rasterize"]
+__all__ = ["DirectRender", "expected_depth", "rasterize"]
 
 
 def rasterize(inputs: Inputs) -> Rasterization:
@@ -68,14 +68,19 @@ def rasterize(inputs: Inputs) -> Rasterization:
         images.append(image)
         alphas.append(alpha)
         if render_depth:
-            hit = alpha > 0
-            depths.append(torch.where(hit, weighted / torch.where(hit, alpha, 1), 0))
+            depths.append(expected_depth(weighted, alpha))
     return Rasterization(
         image=_stack(images),
         alphas=_stack(alphas),
         depths=_stack(depths) if render_depth else None,
         info=RasterInfo(means2d=leaf, radii=info.radii[:, :count], depths=info.depths[:, :count]),
     )
+
+
+def expected_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
+    """Divide the weighted depth by the opacity; 0 where that is 0. [H, W, 1]"""
+    hit = alpha > 0
+    return torch.where(hit, weighted / torch.where(hit, alpha, 1), 0)
 
 
 def _stack(parts: list[Tensor]) -> Tensor:
@@ -187,12 +192,16 @@ class DirectRender:
 
     Args:
         inputs: One camera with a background, and at least `layout.LANES` Gaussians, contiguous and
-            float32, without depth.
+            float32.
     """
 
     info: RasterInfo
     image: Tensor
     """[H, W, 3]"""
+    alpha: Tensor
+    """[H, W, 1]"""
+    weighted: Tensor | None
+    """Depth times opacity, if it is asked for. [H, W, 1]"""
 
     def __init__(self, inputs: Inputs) -> None:
         assert inputs.backgrounds is not None
@@ -202,13 +211,24 @@ class DirectRender:
         self._absgrad = torch.zeros(1, count, 2) if inputs.absgrad else None
         view = make_view(inputs.viewmats[0].double().numpy(), inputs.Ks[0].double().numpy(), inputs)
         absgrad = None if self._absgrad is None else self._absgrad[0]
-        request = Request(view, _flat(self.info, 0), render_depth=False, absgrad=absgrad)
-        self._job = _Job(inputs.gaussians, inputs.backgrounds[0], request)
-        self._rendering, self.image, _, _ = self._job.forward()
+        request = Request(view, _flat(self.info, 0), inputs.render_depth, absgrad)
+        *shapes, opacities, colors = inputs.gaussians
+        if inputs.render_depth:
+            colors, opacities = _without_bad_colors(colors, opacities)
+        self._job = _Job((*shapes, opacities, colors), inputs.backgrounds[0], request)
+        self._rendering, self.image, self.alpha, self.weighted = self._job.forward()
 
-    def backward(self, image_grad: Tensor) -> tuple[Tensor, ...]:
-        """Return the gradients of the Gaussians; that of the centres is in `info`. [H, W, 3]"""
-        *grads, centres = self._job.backward(self._rendering, image_grad, None, None)
+    def backward(
+        self,
+        image_grad: Tensor,
+        alpha_grad: Tensor | None = None,
+        weighted_grad: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """Return the gradients of the Gaussians; that of the centres is in `info`.
+
+        Arguments are gradients of `image`, `alpha` and `weighted`.
+        """
+        *grads, centres = self._job.backward(self._rendering, image_grad, alpha_grad, weighted_grad)
         self.info.means2d.grad = centres[None]
         if self._absgrad is not None:
             self.info.means2d.absgrad = self._absgrad  # type: ignore[attr-defined]

@@ -1,0 +1,85 @@
+"""Term of the loss that holds the surfaces of a model to the sparse points (option `depth_weight`).
+
+Source: Deng et al. 2022, DS-NeRF, which weighs squared deviations by errors of reprojection.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from chronoscene.errors import SceneError
+from chronoscene.methods import TrainingSet
+from chronoscene.training.devices import to_device
+from chronoscene.training.losses import steady_mean
+
+INTERVAL = 4
+"""Every so many views one has the term, as drawing depth takes as long as drawing colours."""
+
+
+class DepthTarget(NamedTuple):
+    """Depths of sparse points in the view of a step."""
+
+    pixels: Tensor
+    """Row times width plus column, each once. int64 [S]"""
+    depths: Tensor
+    """float32 [S]"""
+    weight: float
+    """Of the term in the loss."""
+
+    def term(self, rendered: Tensor) -> Tensor:
+        """Compute weight times mean of ``|rendered / depth - 1|``.
+
+        It has no unit, and a few points in wrong places count little.
+
+        Args:
+            rendered: Depth of the model. [H, W, 1]
+
+        Returns:
+            A scalar; 0 without points.
+        """
+        if not len(self.pixels):
+            return rendered.new_zeros(())
+        deviations = (rendered.flatten()[self.pixels] / self.depths - 1).abs()
+        return self.weight * steady_mean(deviations)
+
+
+class SparseDepth:
+    """Depths of sparse points in the training views, as tensors.
+
+    Args:
+        weight: Mean weight of the term; 0: there is none.
+        train: Has the depths.
+        device: Of the tensors.
+
+    Raises:
+        SceneError: If they are asked for, and no view has any.
+    """
+
+    def __init__(self, weight: float, train: TrainingSet, device: torch.device) -> None:
+        self.weight, self._train, self._device = weight, train, device
+        self._kept: dict[int, DepthTarget] = {}
+        views = range(len(train.views)) if weight else ()
+        if weight and not any(len(train.load_depths(number).pixels) for number in views):
+            raise SceneError(
+                "sparse points",
+                expected="points that at least 3 images observe, for depth_weight",
+                found="none in the training images",
+                todo="triangulate some (chronoscene triangulate), or set depth_weight=0",
+            )
+
+    def target(self, number: int, drawn: int) -> DepthTarget | None:
+        """Return that of a view; None where the step has no such term.
+
+        Args:
+            number: Of the view.
+            drawn: Number of views drawn so far.
+        """
+        if not self.weight or drawn % INTERVAL:
+            return None
+        if number not in self._kept:
+            pixels, depths = (to_device(x, self._device) for x in self._train.load_depths(number))
+            self._kept[number] = DepthTarget(pixels, depths, INTERVAL * self.weight)
+        return self._kept[number]
