@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -109,16 +109,5 @@ def by_period(train: TrainingSet) -> list[TrainingSet]:
     stages = []
     for period in sorted({view.period for view in train.views}):
         own = [i for i, view in enumerate(train.views) if view.period == period]
-        stages.append(_only(train, own))
+        stages.append(train.with_views(own))
     return stages
-
-
-def _only(train: TrainingSet, own: Sequence[int]) -> TrainingSet:
-    """The set with some of its views."""
-    return replace(
-        train,
-        views=tuple(train.views[i] for i in own),
-        load_image=lambda i: train.load_image(own[i]),
-        load_mask=lambda i: train.load_mask(own[i]),
-        expect=lambda indices: train.expect([own[i] for i in indices]),
-    )

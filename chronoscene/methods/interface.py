@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
@@ -101,6 +101,17 @@ class TrainingSet:
     """Function to call with the views whose images will be loaded next, in their order: they are
     decoded while the method does something else. A method that never calls it waits for each
     image."""
+
+    def with_views(self, numbers: Sequence[int]) -> TrainingSet:
+        """Return the set with some of its views, in the order of these numbers."""
+        return replace(
+            self,
+            views=tuple(self.views[i] for i in numbers),
+            load_image=lambda i: self.load_image(numbers[i]),
+            load_mask=lambda i: self.load_mask(numbers[i]),
+            load_depths=lambda i: self.load_depths(numbers[i]),
+            expect=lambda indices: self.expect([numbers[i] for i in indices]),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

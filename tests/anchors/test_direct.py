@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from benchmarks.training.generated import make, training_set
 from chronoscene.anchors.trainer import AnchorTrainer, Drawn
 from chronoscene.errors import ShapeError
+from chronoscene.methods import SparseDepths
 from chronoscene.training.drawing import Chance
 
 OPTIONS: list[dict[str, Any]] = [
@@ -18,11 +20,16 @@ OPTIONS: list[dict[str, Any]] = [
     {"antialiased": True, "scale_weight": 0.0, "global_dim": 0},
     {"random_background": True, "period_dim": 0},
     {"opacity_dropout": 0.3, "scale_weight": 0.1},
+    {"depth_weight": 0.3, "opacity_dropout": 0.3},
 ]
 
 
 def trainer_of(options: dict[str, Any], points: int = 300) -> AnchorTrainer:
-    method = make(training_set(points, 40, 30), "chronogs", "fast", options)
+    def depths(index: int) -> SparseDepths:
+        return SparseDepths(np.arange(0, 1200, 7), np.linspace(1, 4, 172, dtype=np.float32))
+
+    train = replace(training_set(points, 40, 30), load_depths=depths)
+    method = make(train, "chronogs", "fast", options)
     for index in range(5):  # so that global features and all layers have gradients
         method.step(index, 0.3)
     return method.trainer  # type: ignore[attr-defined, no-any-return]
@@ -32,7 +39,8 @@ def learn(trainer: AnchorTrainer, way: str) -> tuple[Any, dict[str, torch.Tensor
     number, row = 4, int(trainer.feature_rows[4])
     view, photo = trainer.train.views[number], torch.from_numpy(trainer.train.load_image(number))
     seen = trainer.optimizer.seen(trainer.model.visible(view), row)
-    due = Drawn(number, Chance(0, trainer.sampler.drawn, 0.5), photo, None)
+    target = trainer.sparse_depth.target(number, 0)
+    due = Drawn(number, Chance(0, trainer.sampler.drawn, 0.5), photo, None, target)
     found = (trainer._learn_directly if way == "direct" else trainer._learn_by_autograd)(seen, due)
     return found, seen.gradients()
 

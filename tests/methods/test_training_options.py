@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.train import painted_balls
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object, load_spec
+from chronoscene.methods.interface import no_depths
+from chronoscene.training import sparse_depth
 from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.views import downscale_view
 
@@ -40,6 +42,9 @@ OPTIONS = [
     ("cl-splats", {"views_per_step": 2}),
     ("3dgs", {"opacity_dropout": 0.4}),
     ("chronogs", {"opacity_dropout": 0.4, "views_per_step": 2}),
+    ("3dgs", {"depth_weight": 0.3}),
+    ("gs-w", {"depth_weight": 0.3, "exposure": "image"}),
+    ("chronogs", {"depth_weight": 0.3, "views_per_step": 2}),
     ("3dgs", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
     ("gs-w", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
 ]
@@ -126,6 +131,21 @@ def test_steps_leave_gaussians_out_once_the_training_is_under_way(name):
     assert abs(thinned.step(1, 0.9).loss - usual.step(1, 0.9).loss) > 1e-4
 
 
+@pytest.mark.parametrize("name", ["3dgs", "scaffold-gs", "chronogs", *GAUSSIANS])
+def test_surfaces_are_held_to_the_sparse_points(name, monkeypatch):
+    monkeypatch.setattr(sparse_depth, "INTERVAL", 1)  # so that a few steps are enough
+    data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))
+    deviations = []
+    for weight in (0.0, 1.0):
+        method = start(name, data, depth_weight=weight)
+        train(method)
+        rendered = [method.render(view, float(view.period)).depth for view in data.views]
+        known = [data.load_depths(index) for index in range(len(data.views))]
+        ratios = [d.flat[k.pixels] / k.depths for d, k in zip(rendered, known, strict=True)]
+        deviations.append(float(np.mean(np.abs(np.concatenate(ratios) - 1))))
+    assert deviations[1] < 0.95 * deviations[0]
+
+
 @pytest.mark.parametrize("name", ["3dgs", *GAUSSIANS])
 def test_a_cooldown_lowers_the_rates_of_all_tensors_in_its_share(name, monkeypatch):
     """Networks and planes are among them. Anchors: tests/chronogs/test_training.py."""
@@ -205,6 +225,17 @@ def test_a_training_goes_on_with_as_many_views_to_a_step(tmp_path):
         CheckpointError, match=r"views_per_step: expected 2, found 1; continue with"
     ):
         second.load_training(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["3dgs", "chronogs"])
+def test_points_that_no_image_observes_hold_no_surface(name):
+    data = replace(painted_balls.make_training_set(1), load_depths=no_depths)
+    with pytest.raises(
+        SceneError, match=r"at least 3 images observe, for depth_weight, found none"
+    ):
+        start(name, data, depth_weight=0.1)
+    with pytest.raises(ConfigError, match=r"absgrad: expected False with depth_weight"):
+        start(name, data, depth_weight=0.1, absgrad=True)
 
 
 def test_methods_without_steps_of_several_views_say_so():

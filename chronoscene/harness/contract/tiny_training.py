@@ -38,12 +38,12 @@ def make_stage(period: int, *, hide_period: bool) -> TrainingSet:
     data = make_training_set(3)
     own = [i for i, view in enumerate(data.views) if view.period == period]
     known = 1 if hide_period else period + 1
+    stage = data.with_views(own)
     return replace(
-        data,
-        views=tuple(replace(data.views[i], period=known - 1) for i in own),
+        stage,
+        views=tuple(replace(view, period=known - 1) for view in stage.views),
         num_periods=known,
         point_periods=data.point_periods[:, :known],
-        load_image=lambda i: data.load_image(own[i]),
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.methods import TrainingSet, TrainingView
+from chronoscene.methods import SparseDepths, TrainingSet, TrainingView
 from chronoscene.scene.similarity import Sim3
 
 WIDTH, HEIGHT = 40, 30
@@ -51,6 +51,19 @@ def paint(view: TrainingView, centres: Any, radii: Any, colors: Any) -> np.ndarr
     return np.rint(255 * image).astype(np.uint8)
 
 
+def front_depths(view: TrainingView, centres: Any, radii: Any) -> SparseDepths:
+    """Return the depth of each ball in front of its centre, where no other covers that pixel."""
+    inside = centres @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    xy = np.floor(inside[:, :2] / inside[:, 2:] @ view.K[:2, :2].T + view.K[:2, 2]).astype(int)
+    numbers = np.tile(np.arange(len(centres)), (3, 1)).T / len(centres)
+    shown = paint(view, centres, radii, numbers)[..., 0]
+    seen = np.flatnonzero(((xy >= 0) & (xy < (view.width, view.height))).all(axis=1))
+    seen = seen[shown[xy[seen, 1], xy[seen, 0]] == np.rint(255 * numbers[seen, 0])]
+    pixels, first = np.unique(xy[seen, 1] * view.width + xy[seen, 0], return_index=True)
+    depths = (inside[:, 2] - radii)[seen[first]]
+    return SparseDepths(pixels, depths.astype(np.float32))
+
+
 def make_training_set(num_periods: int) -> TrainingSet:
     """Return a training set of T periods; images are painted when they are loaded first."""
     centres, radii, colors = make_balls(num_periods)
@@ -77,4 +90,5 @@ def make_training_set(num_periods: int) -> TrainingSet:
         scene_extent=1.1,
         background=np.zeros(3, np.float32),
         load_image=load_image,
+        load_depths=lambda index: front_depths(views[index], centres, radii),
     )
