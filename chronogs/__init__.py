@@ -33,7 +33,7 @@ _SHORT: dict[str, Any] = _FULL | {
 }
 """Fewer numbers for each period, and other rates: what-a-scene-requires.md and tuning.md in
 docs/experiments have the trials; generalisation.md those of the dropout of ``accurate``, which has
-a decay as well: long trainings learn photos by heart."""
+a decay as well: long trainings learn photos by heart; survey-accuracy.md those of ``survey``."""
 
 _TEXT: dict[str, Any] = {
     "fusion": "sum",
@@ -70,6 +70,7 @@ SPEC = MethodSpec(
         "full": _FULL | {"iterations": 3_000},
         "fast": _SHORT | {"iterations": 1_000, "density_interval": 40},
         "balanced": _SHORT | {"iterations": 3_000},
+        "survey": _SHORT | {"iterations": 3_000, "depth_weight": 0.1},
         "accurate": _SHORT
         | {"iterations": 8_000, "opacity_dropout": 0.2, "period_decay": 0.3, **MANY_ANCHORS},
     },

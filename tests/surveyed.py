@@ -55,15 +55,15 @@ def make_scene(root=Path("scene"), world=None):
     xyz = np.stack([east, north, np.zeros_like(east)], axis=-1).reshape(-1, 3)
     xyz[::50, 2] = 3.0
     count = len(xyz)
-    frames_of = np.repeat(np.arange(count) % 2 * 16, 2) + np.tile([0, 5], count)
+    frames_of = np.repeat(np.arange(count) % 2 * 16, 3) + np.tile([0, 5, 10], count)
     points = Points(
         ids=np.arange(1, count + 1),
         xyz=xyz,
         rgb=np.full((count, 3), 100, np.uint8),
         error=np.zeros(count),
-        track_start=np.arange(count + 1) * 2,
+        track_start=np.arange(count + 1) * 3,
         track_frame=frames_of.astype(np.int32),
-        track_xy=np.zeros((2 * count, 2)),
+        track_xy=np.zeros((3 * count, 2)),
     )
     return Scene(
         "site", root, root, tuple(frames), points, (Period(0, "before"), Period(1, "after")),
@@ -78,7 +78,7 @@ class ToyRun:
         self.found, self.noise, self.distinguishes_periods = scene, noise, uses_period
         self.num_periods, self.folder = 2, Path("run")
         self.record = SimpleNamespace(max_width=1600, label="site: toy", strategy="pooled")
-        self.spec = SimpleNamespace(title="Toy")
+        self.spec, self.config = SimpleNamespace(title="Toy"), SimpleNamespace()
 
     def render(self, camera, cam_from_world, period):
         return render(camera, cam_from_world, period, noise=self.noise)

@@ -36,7 +36,7 @@ MIN_KNOWN = 0.5  # Share of a square whose truth must be known
 
 def true_heights(scene: Scene, grid: Grid, period: int) -> Array:
     """Height of the highest point that a test view sees in each cell. [H, W]"""
-    heights = np.full(grid.width * grid.height, -np.inf)
+    heights = np.full(grid.shape, -np.inf)
     for frame in scene.select(split="test"):
         depth = load_depth(
             scene.root / "gt", frame.name, None if frame.period == period else period
@@ -46,11 +46,8 @@ def true_heights(scene: Scene, grid: Grid, period: int) -> Array:
             viewpoint = Viewpoint(frame.name, frame.camera, frame.cam_from_world, period)
             xyz = back_project(depth, viewpoint)
             xyz = xyz[grid.holds(xyz)]
-            column = ((xyz[:, 0] - grid.left) / grid.resolution).astype(int)
-            row = ((grid.top - xyz[:, 1]) / grid.resolution).astype(int)
-            inside = (column < grid.width) & (row < grid.height)
-            np.maximum.at(heights, (row * grid.width + column)[inside], xyz[inside, 2])
-    return np.where(np.isfinite(heights), heights, np.nan).reshape(grid.shape)
+            np.maximum.at(heights, grid.cells(xyz), xyz[:, 2])
+    return np.where(np.isfinite(heights), heights, np.nan)
 
 
 def read(path: Path) -> Array:

@@ -153,10 +153,15 @@ PLUGIN = click.option(
     "Its code is executed.",
 )
 
+
+def preset_option(default: str) -> Callable[[click.decorators.FC], click.decorators.FC]:
+    """Make the option ``--preset``."""
+    text = "Preset of the methods, or a file FILE.toml with one."
+    return click.option("--preset", default=default, help=text)
+
+
 _TRAINING = {
-    "preset": click.option(
-        "--preset", default="balanced", help="Preset of the methods, or a file FILE.toml with one."
-    ),
+    "preset": preset_option("balanced"),
     "iterations": click.option(
         "--iterations", type=click.IntRange(min=1), help="Stop after this many iterations."
     ),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chronoscene.arrays import Array, Mask
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.errors import ConfigError
 from chronoscene.images.store import evaluation_size, resize_camera
 from chronoscene.scene import Scene
@@ -52,6 +52,12 @@ class Grid:
         bottom = self.top - self.height * self.resolution
         low, high = (self.left, bottom, self.low), (right, self.top, self.high)
         return np.asarray(((places >= low) & (places <= high)).all(axis=1))
+
+    def cells(self, places: Array) -> tuple[Ints, Ints]:
+        """Return row and column of the cells below places that the grid `holds`. [N, 3] -> [N]"""
+        column = ((places[:, 0] - self.left) / self.resolution).astype(int)
+        row = ((self.top - places[:, 1]) / self.resolution).astype(int)
+        return np.minimum(row, self.height - 1), np.minimum(column, self.width - 1)
 
     def tiles(self, size: int) -> Iterator[tuple[slice, slice]]:
         """Yield rows and columns of parts of at most ``size`` cells a side."""

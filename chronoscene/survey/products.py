@@ -32,11 +32,15 @@ from chronoscene.survey.figure import draw_difference
 from chronoscene.survey.grid import Grid, choose_grid, natural_resolution
 from chronoscene.survey.map_frame import MapFrame, map_frame
 from chronoscene.survey.rasters import WHOLE, Polygon, read_polygons, write_raster
-from chronoscene.survey.surface import Surface, map_surface
+from chronoscene.survey.surface import Surface, check_heights, map_surface
 from chronoscene.survey.uncertainty import UNKNOWN, certified_registration
 from chronoscene.survey.views import depth_views
 
 SUMMARY, VOLUMES = "survey.json", "volumes.csv"
+FREE = (
+    "the model was not held to the sparse points; with --preset survey of chronogs, or --set "
+    "depth_weight=0.1, lawns and other places without texture lie at their height"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +245,11 @@ def survey_run(
         clouds[period] = dense_cloud(views, work.frame, grid)
         work.write_period(period, grid, surface)
         known = float(np.isfinite(surface.heights).mean())
-        summary = {"known_share": known, "height_deviation": median_of(surface.spread)}
+        summary = {
+            "known_share": known,
+            "height_deviation": median_of(surface.spread),
+            "sparse_points": check_heights(surface, scene, period, work.frame, grid),
+        }
         periods.append(work.write_cloud(period, clouds[period]) | summary)
     for number, pair in enumerate(options.pairs, run.num_periods):
         report("survey", number, steps)
@@ -250,7 +258,8 @@ def survey_run(
         distances = work.compare_clouds(pair, clouds, resolution, sigma)
         pairs.append({"periods": list(pair)} | made | distances)
     head = {"scene": scene.name, "run": run.record.label, "coordinates": work.coordinates()}
-    return head | {"raster": asdict(grid), "periods": periods, "pairs": pairs}
+    made = head | {"raster": asdict(grid), "periods": periods, "pairs": pairs}
+    return made if getattr(run.config, "depth_weight", 1.0) else made | {"note": FREE}
 
 
 def survey_scene(scene: Scene, folder: Path, options: SurveyOptions) -> dict[str, Any]:

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints
 from chronoscene.harness.files.predictions import to_bytes
+from chronoscene.harness.plan.sparse_depths import MIN_IMAGES
 from chronoscene.methods import Prediction
-from chronoscene.scene import Camera
+from chronoscene.scene import Camera, Scene
 from chronoscene.scene.geometry import pose_from_rotation_translation
+from chronoscene.scene.similarity import SIGMA
 from chronoscene.survey.grid import Grid
 from chronoscene.survey.map_frame import MapFrame
 from chronoscene.survey.views import DepthView, look, solid_depth
@@ -60,6 +62,32 @@ def map_surface(render: Render, views: Sequence[DepthView], frame: MapFrame, gri
     count[known], spread[known] = look(places, views, SEEN, up=frame.axes[2])
     heights[count < MIN_VIEWS] = spread[count < MIN_VIEWS] = np.nan
     return Surface(heights, colors, spread, count)
+
+
+def check_heights(
+    surface: Surface, scene: Scene, period: int, frame: MapFrame, grid: Grid
+) -> dict[str, float | int] | None:
+    """Compare heights with the sparse points that training photos of the period see.
+
+    Only points that three images see count; those below trees and on walls count as errors, which
+    change a median little.
+
+    Returns:
+        ``count`` of the points; ``median`` and ``nmad`` of the height of their cells minus theirs,
+        in metres; None without points.
+    """
+    points = scene.points
+    train = np.array([image.split == "train" for image in scene.frames])
+    counted = scene.point_periods(train)[:, period] & (np.diff(points.track_start) >= MIN_IMAGES)
+    places = frame.to_map(points.xyz[counted])
+    places = places[grid.holds(places)]
+    errors = surface.heights[grid.cells(places)] - places[:, 2]
+    errors = errors[np.isfinite(errors)]
+    if not len(errors):
+        return None
+    median = float(np.median(errors))
+    spread = SIGMA * float(np.median(np.abs(errors - median)))
+    return {"count": len(errors), "median": median, "nmad": spread}
 
 
 def camera_above(

@@ -27,7 +27,7 @@ class DepthTarget(NamedTuple):
     depths: Tensor
     """float32 [S]"""
     weight: float
-    """Of the term in the loss."""
+    """Factor of the term in the loss."""
 
     def term(self, rendered: Tensor) -> Tensor:
         """Compute weight times mean of ``|rendered / depth - 1|``.

@@ -40,6 +40,16 @@ def survey(*arguments):
     return CliRunner().invoke(cli, ["survey", *map(str, arguments)])
 
 
+def test_a_model_that_was_not_held_to_the_points_says_so(site, tmp_path):
+    run, toy = site
+    toy.config.depth_weight = 0.0
+    result = survey(run, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "note: the model was not held to the sparse points" in result.output
+    toy.config.depth_weight = 0.1
+    assert "note" not in survey(run, "--out", tmp_path / "held").output
+
+
 def test_all_products_of_a_run(site, tmp_path):
     run, _ = site
     pit = PLACE.to_geodetic(np.array([[x, y, 0.0] for x, y in ((1, -2), (7, -2), (7, 5), (1, 5))]))
@@ -65,6 +75,9 @@ def test_all_products_of_a_run(site, tmp_path):
         assert float(row["cut_m3"]) == pytest.approx(0, abs=0.5)
     assert float(box["area_m2"]) == pytest.approx(42, rel=0.1)
     assert "before → after" in result.stdout and "EPSG:32632" in result.stdout
+    heights = summary["periods"][0]["sparse_points"]
+    assert f"heights minus {heights['count']} sparse points: median " in result.stdout
+    assert "note" not in summary
     with rasterio.open(out / "surface_after_1.tif") as file:
         assert file.crs.to_epsg() == 32632
         from pyproj import Transformer

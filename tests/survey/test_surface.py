@@ -1,5 +1,6 @@
 """Maps of a scene whose heights are known."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,7 +12,7 @@ from chronoscene.harness.use.cameras import Viewpoint
 from chronoscene.methods import Prediction
 from chronoscene.survey.grid import choose_grid, natural_resolution
 from chronoscene.survey.map_frame import map_frame
-from chronoscene.survey.surface import TILE, camera_above, map_surface
+from chronoscene.survey.surface import TILE, camera_above, check_heights, map_surface
 from chronoscene.survey.views import DepthView, depth_views, look, solid_depth
 
 
@@ -39,6 +40,27 @@ def test_each_cell_has_the_height_at_its_centre(scene, resolution):
     np.testing.assert_allclose(surface.heights[known & ~roof], 0.0, atol=1e-3)
     assert known.mean() > 0.9
     assert (surface.colors[roof] == np.round(ROOF * 255)).all()
+
+
+def test_heights_are_compared_with_the_points_that_the_period_sees(scene):
+    frame = map_frame(scene, None)
+    grid, surface = surface_of(scene, 0)
+    surface = replace(surface, heights=surface.heights - 0.25)
+    seen = np.isfinite(surface.heights[grid.cells(scene.points.xyz[::2])]).sum()
+    found = check_heights(surface, scene, 0, frame, grid)
+    assert found["count"] == seen > 100
+    assert found["median"] == pytest.approx(-0.25, abs=1e-3)
+    assert found["nmad"] == pytest.approx(0, abs=1e-3)
+    two_images = replace(scene, points=scene.points.select_observations(
+        scene.points.track_frame % 16 != 5, np.arange(32, dtype=np.int32)
+    ))  # fmt: skip
+    assert check_heights(surface, two_images, 0, frame, grid) is None
+
+
+def test_cells_are_those_below_the_places(scene):
+    grid = choose_grid(scene, map_frame(scene, None), 0.5)
+    row, column = grid.cells(np.array([[-8.99, 6.99, 0.0], [-8.4, 6.99, 0.0], [9.0, -7.0, 0.0]]))
+    assert (list(row), list(column)) == ([0, 0, 27], [0, 1, 35])
 
 
 def test_edges_are_multiples_of_the_resolution_around_the_points(scene):

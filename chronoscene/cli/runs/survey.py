@@ -105,8 +105,16 @@ def _print(summary: Mapping[str, Any]) -> None:
         table = Table(names, rows, labels=2, title=title)
         emit(boxed_text(table, width=terminal_width()))
     for period in summary["periods"]:
-        emit(f"period {period['label']}: {period['points']:,} points\n")
+        emit(f"period {period['label']}: {period['points']:,} points{_heights(period)}\n")
     coordinates = summary["coordinates"]
     emit(f"coordinates: {coordinates['note'] or coordinates['crs']}\n")
     if "note" in summary:
         say(f"note: {summary['note']}", fg="yellow")
+
+
+def _heights(period: Mapping[str, Any]) -> str:
+    found = period.get("sparse_points")
+    if found is None:
+        return ""
+    numbers = f"median {found['median']:+.2f} m, NMAD {found['nmad']:.2f} m"
+    return f"; heights minus {found['count']:,} sparse points: {numbers}"
