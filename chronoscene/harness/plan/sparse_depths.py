@@ -38,15 +38,16 @@ def depth_loader(
 
     @cache
     def observed() -> list[Ints]:
-        """List the points of each image of the scene."""
+        """List the usable points of each of the frames."""
         owners = track_owners(points.track_start)
-        return [owners[rows] for rows in by_image(points.track_frame, len(scene.frames))]
+        rows = by_image(points.track_frame, len(scene.frames))
+        seen = (owners[rows[numbers[frame.name]]] for frame in frames)
+        return [point[usable[point]] for point in seen]
 
     def load(index: int) -> SparseDepths:
         frame = frames[index]
-        seen = observed()[numbers[frame.name]]
         pose, camera = frame.cam_from_world, store.camera(frame)
-        local = points.xyz[seen[usable[seen]]] @ pose[:3, :3].T + pose[:3, 3]
+        local = points.xyz[observed()[index]] @ pose[:3, :3].T + pose[:3, 3]
         local = local[np.argsort(local[:, 2], kind="stable")]
         with np.errstate(invalid="ignore"):
             xy = np.floor(project_points(camera, local))
