@@ -38,10 +38,8 @@ class DepthTarget(NamedTuple):
             rendered: Depth of the model. [H, W, 1]
 
         Returns:
-            A scalar; 0 without points.
+            A scalar.
         """
-        if not len(self.pixels):
-            return rendered.new_zeros(())
         deviations = (rendered.flatten()[self.pixels] / self.depths - 1).abs()
         return self.weight * steady_mean(deviations)
 
@@ -67,11 +65,12 @@ class SparseDepth:
                 "sparse points",
                 expected="points that at least 3 images observe, for depth_weight",
                 found="none in the training images",
-                todo="triangulate some (chronoscene triangulate), or set depth_weight=0",
+                todo="triangulate some (chronoscene triangulate), or set depth_weight=0, as preset "
+                "balanced does",
             )
 
     def target(self, number: int, drawn: int) -> DepthTarget | None:
-        """Return that of a view; None where the step has no such term.
+        """Return that of a view; None where the step has no such term, or the view no points.
 
         Args:
             number: Of the view.
@@ -82,4 +81,5 @@ class SparseDepth:
         if number not in self._kept:
             pixels, depths = (to_device(x, self._device) for x in self._train.load_depths(number))
             self._kept[number] = DepthTarget(pixels, depths, INTERVAL * self.weight)
-        return self._kept[number]
+        target = self._kept[number]
+        return target if len(target.pixels) else None

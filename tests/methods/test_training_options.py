@@ -228,6 +228,16 @@ def test_a_training_goes_on_with_as_many_views_to_a_step(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["3dgs", "chronogs"])
+def test_views_without_sparse_points_are_learned_all_the_same(name):
+    data = painted_balls.make_training_set(1)
+    some = replace(
+        data, load_depths=lambda index: (no_depths if index else data.load_depths)(index)
+    )
+    reports = train(start(name, some, depth_weight=0.1))
+    assert not any(report.skipped for report in reports) and reports[-1].loss < reports[0].loss
+
+
+@pytest.mark.parametrize("name", ["3dgs", "chronogs"])
 def test_points_that_no_image_observes_hold_no_surface(name):
     data = replace(painted_balls.make_training_set(1), load_depths=no_depths)
     with pytest.raises(

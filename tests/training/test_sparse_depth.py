@@ -10,6 +10,7 @@ import torch
 
 from chronoscene.harness.train.painted_balls import make_training_set
 from chronoscene.methods import SparseDepths
+from chronoscene.methods.interface import no_depths
 from chronoscene.training.sparse_depth import INTERVAL, DepthTarget, SparseDepth
 
 
@@ -28,9 +29,13 @@ def test_the_term_is_the_mean_relative_deviation_of_the_pixels_with_points() -> 
     np.testing.assert_allclose(image.grad.flatten(), gradient, rtol=1e-12)
 
 
-def test_a_view_without_points_has_a_term_of_zero() -> None:
-    nothing = DepthTarget(torch.zeros(0, dtype=torch.int64), torch.zeros(0), 0.5)
-    assert nothing.term(torch.ones(3, 4, 1)).item() == 0.0
+def test_a_view_without_points_has_no_term() -> None:
+    data = make_training_set(1)
+    some = replace(
+        data, load_depths=lambda index: (no_depths if index else data.load_depths)(index)
+    )
+    depths = SparseDepth(0.1, some, torch.device("cpu"))
+    assert depths.target(0, INTERVAL) is not None and depths.target(1, INTERVAL) is None
 
 
 def test_every_so_many_views_have_the_term_with_a_weight_that_makes_up_for_the_others() -> None:
