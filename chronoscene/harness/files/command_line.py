@@ -19,6 +19,8 @@ FLAGS = ("validation", "fit_half")
 def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None) -> str:
     """Write the command that trains a configuration, and the one that compresses it, if any.
 
+    ``module:SPEC`` stands for a method that is not installed: ``bench`` does not know its name.
+
     Args:
         scene: Argument that stands for its folder.
         config: ``method``, ``strategy``, ``preset`` and ``variant`` (`ResolvedMethod.run`, and what
@@ -26,9 +28,9 @@ def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None)
         seed: None leaves the option out.
     """
     words = ["chronoscene", "bench", scene]
-    for name in ("method", "strategy"):
-        words += [f"--{name}", config[name]]
-    words += ["--preset", _preset(config["method"], config["preset"])]
+    method = config["method"]
+    words += ["--method", method if method in installed_methods() else "module:SPEC"]
+    words += ["--strategy", config["strategy"], "--preset", _preset(method, config["preset"])]
     words += [] if seed is None else ["--seed", str(seed)]
     compress: list[str] = []
     for name, value in variant_options(config["variant"]).items():

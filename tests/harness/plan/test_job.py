@@ -175,6 +175,12 @@ def test_the_command_names_what_differs_from_the_preset():
     assert command_line("DIR", config, 0).endswith("--seed 0 --set sh_degree=2 --budget 90s")
 
 
+@pytest.mark.parametrize(("method", "name"), [("3dgs", "3dgs"), ("not-installed", "module:SPEC")])
+def test_the_command_has_no_name_that_bench_does_not_know(method, name):
+    config = {"method": method, "strategy": "joint", "preset": "fast", "variant": ""}
+    assert f" --method {name} " in command_line("DIR", config)
+
+
 def test_the_command_names_the_file_of_a_preset_that_the_method_lacks():
     for method, preset in (("3dgs", "mine.toml"), ("3dgs", "fast"), ("not-installed", "mine")):
         name = preset.removesuffix(".toml")

@@ -108,7 +108,7 @@ def test_the_table_has_the_front_alone():
 def test_the_configuration_for_limits(limits, method):
     (sentence,) = choose(RUNS, limits, "--what was-typed")
     assert sentence.startswith(f"plaza, cpu (Test, 2 threads): {method.upper()} (joint, fast) ")
-    assert sentence.endswith(f"bench DIR --method {method} --strategy joint --preset fast")
+    assert sentence.endswith("bench DIR --method module:SPEC --strategy joint --preset fast")
 
 
 def test_a_training_may_exceed_a_time_by_its_last_step():
