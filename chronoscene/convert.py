@@ -9,6 +9,7 @@ from pathlib import Path
 
 from chronoscene.checks import check_choice
 from chronoscene.formats import detect, load_format, writable_formats
+from chronoscene.formats.chronoscene import TEST
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.io.staging import check_outside
 from chronoscene.scene import Scene
@@ -73,12 +74,20 @@ def remarks_on(scene: Scene, written: Collection[str] = ()) -> list[str]:
     others = module.others(scene.root) if hasattr(module, "others") else []
     if left := [name for name in others if name not in written]:
         found.append(f"not part of the format, and not converted: {', '.join(left)}")
+    found += unread_tests(scene.root, scene.split_rule)
     if scene.images_root != scene.root and (count := _unused_images(scene)):
         where = scene.images_root.relative_to(scene.root)
         found.append(
             f"{count} image files in {where}/ are not part of the scene and were not converted"
         )
     return found
+
+
+def unread_tests(root: Path, rule: str) -> list[str]:
+    """Tell that a list of test images is there, where the format has another rule."""
+    if rule == TEST or not (root / TEST).exists():
+        return []
+    return [f"{TEST} is not read; split: {rule}"]
 
 
 def _unused_images(scene: Scene) -> int:

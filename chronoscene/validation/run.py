@@ -14,7 +14,7 @@ import numpy as np
 
 from chronoscene import formats
 from chronoscene.colmap.raw_model import find_model, model_files
-from chronoscene.convert import remarks_on
+from chronoscene.convert import remarks_on, unread_tests
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import DetectedFormat
 from chronoscene.formats import chronoscene as our_format
@@ -134,7 +134,9 @@ def _read_project(scene: RawScene, detected: DetectedFormat) -> Origin:
         return Origin(detected, is_project=True, error=error)
     if not scene.names:
         return Origin(detected, is_project=True)
-    return Origin(detected, is_project=True, assigned=_with_labels(assigned, detected))
+    remarks = () if assigned.tests is None else tuple(unread_tests(scene.root, assigned.rule))
+    labelled = _with_labels(assigned, detected)
+    return Origin(detected, is_project=True, remarks=remarks, assigned=labelled)
 
 
 def _with_labels(assigned: Assigned, detected: DetectedFormat) -> Assigned:

@@ -152,6 +152,18 @@ def test_what_is_left_out_of_another_format(studio):
     assert "1 frame" in finding.found
 
 
+@pytest.mark.parametrize(
+    ("target", "rule"), [("cl-splats", "every 8th image of all"), ("neusc", "every 10th image")]
+)
+def test_a_list_of_test_images_that_is_not_read(scene, tmp_path, target, rule):
+    other = convert(scene.root, tmp_path / target, target=target).out
+    assert "CS008" not in codes(validate_scene(other))
+    (other / "sparse/0").mkdir(parents=True, exist_ok=True)
+    (other / "sparse/0/test.txt").write_text("a000.png\n")
+    (finding,) = [f for f in validate_scene(other).findings if f.code == "CS008"]
+    assert finding.found.startswith(f"sparse/0/test.txt is not read; split: {rule}")
+
+
 def test_scene_of_another_format_that_cannot_be_read(studio):
     (studio / "transforms.json").write_text('{"frames": [{"file_path": 3}]}')
     report = validate_scene(studio)
@@ -266,7 +278,7 @@ def test_projects_whose_test_images_their_format_chooses(project, tmp_path):
     (street / "sparse/0/test.txt").write_text("")
     report = validate_scene(street, options=ReadOptions("wat"))
     assert [(p.images, p.test) for p in report.summary.periods] == [(9, 2), (9, 2)]
-    assert codes(report) == {"CS006", "CS507"}
+    assert codes(report) == {"CS006", "CS008", "CS507"}
     (street / "sparse/0/test.txt").unlink()
     report = validate_scene(street)
     assert [(p.images, p.test) for p in report.summary.periods] == [(9, 2), (9, 2)]
