@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from statistics import median
 
-from chronoscene.formats.chronoscene import SPLIT, TEST
+from chronoscene.errors import ChronoSceneError
+from chronoscene.formats.chronoscene import PERIODS, SPLIT, TEST
 from chronoscene.io.wording import counted
 from chronoscene.scene.splits import SplitEntry, check_period_ids
 from chronoscene.validation import rule
@@ -169,6 +171,20 @@ def periods_unequal(scene: RawScene) -> Iterator[Hit]:
     for period, number in train.items():
         if 0 < number * UNEQUAL < most:
             yield Hit(f"period {period}", f"at least a tenth of {most} training views", str(number))
+
+
+@rule.warning(
+    "CS410",
+    bad='two periods with the label "May"',
+    remedy="give each period a label of its own in sparse/periods.json",
+    needs=("periods",),
+)
+def label_twice(scene: RawScene) -> Iterator[Hit]:
+    """Several periods have the same label, so figures and pages do not tell them apart."""
+    with suppress(ChronoSceneError):  # has its own rule
+        for label, count in Counter(p.label for p in scene.period_table()).items():
+            if count > 1:
+                yield Hit(PERIODS, "a label of its own for each period", f"{label!r} {count} times")
 
 
 def _views(scene: RawScene) -> dict[int, tuple[int, int]]:

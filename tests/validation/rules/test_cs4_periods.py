@@ -77,6 +77,11 @@ def test_single_period(scene):
     assert {f.code for f in report.findings} == {"CS406"}
 
 
+def test_a_label_of_two_periods(scene):
+    scene.write("sparse/periods.json", '[{"id": 0, "label": "May"}, {"id": 1, "label": "May"}]')
+    scene.expect("CS410", place="sparse/periods.json", found="'May' 2 times")
+
+
 def test_summary_counts_views(scene):
     periods = scene.validate().summary.periods
     assert [(p.id, p.images, p.train, p.test) for p in periods] == [(0, 9, 6, 3), (1, 9, 6, 3)]
