@@ -12,7 +12,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from itertools import chain
 from pathlib import Path
@@ -42,6 +42,7 @@ UNTRAINED = "untrained"
 GROUND_TRUTH = "ground_truth"
 PHOTOS = "photos"
 FIGURES = "figures"
+LOCKS = ".locks"  # Folder with a file for each run, and one for the summary
 
 
 def _number(value: float) -> float:
@@ -381,19 +382,26 @@ def _is_final(folder: Path) -> bool:
     return folder.name.removeprefix("seed").isdigit()
 
 
-def write_summary(runs: Path, folders: Sequence[Path] | None = None) -> list[RunRecord]:
+def write_summary(runs: Path, without: Collection[Path] = ()) -> list[RunRecord]:
     """Write ``results.json`` and ``rows.csv`` of all finished runs below a folder.
+
+    Commands that share the folder do so one after the other: the last one has the runs of all.
 
     Args:
         runs: The folder.
-        folders: Runs that are in the files; None for all.
+        without: Runs that are left out.
     """
-    folders = run_folders(runs) if folders is None else folders
-    records = [read_run(folder) for folder in folders]
-    documents = [json.loads(record.model_dump_json()) for record in records]
-    write_text_atomic(runs / RESULTS_FILE, json.dumps(documents, indent=1, allow_nan=False) + "\n")
-    lines = [",".join((*RUN_COLUMNS, *ROW_COLUMNS)) + "\n"]
-    for folder in folders:
-        lines += (folder / ROWS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)[1:]
-    write_text_atomic(runs / ROWS_FILE, "".join(lines))
+    from filelock import FileLock
+
+    (runs / LOCKS).mkdir(parents=True, exist_ok=True)
+    with FileLock(runs / LOCKS / "summary.lock"):
+        folders = [folder for folder in run_folders(runs) if folder not in without]
+        records = [read_run(folder) for folder in folders]
+        documents = [json.loads(record.model_dump_json()) for record in records]
+        text = json.dumps(documents, indent=1, allow_nan=False) + "\n"
+        write_text_atomic(runs / RESULTS_FILE, text)
+        lines = [",".join((*RUN_COLUMNS, *ROW_COLUMNS)) + "\n"]
+        for folder in folders:
+            lines += (folder / ROWS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)[1:]
+        write_text_atomic(runs / ROWS_FILE, "".join(lines))
     return records

@@ -18,8 +18,6 @@ from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.settings import RunSettings
 from chronoscene.scene import Scene
 
-LOCKS = ".locks"  # Folder beside the results, with a file for each run
-
 LONGEST_NAME = 180  # Characters; file systems allow 255 bytes, and special ones become longer
 
 

@@ -21,7 +21,8 @@ from chronoscene.checks import import_extra
 from chronoscene.errors import BackendError, ChronoSceneError, ConfigError
 from chronoscene.harness.files import records
 from chronoscene.harness.files.provenance import code_version
-from chronoscene.harness.plan.job import LOCKS, Job
+from chronoscene.harness.files.records import LOCKS
+from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.settings import BenchSettings
 from chronoscene.harness.run.process import put_in_place, run_staged, staged
 from chronoscene.io.processes import Report, Stop

@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 
 from chronoscene.harness.files import records
 from chronoscene.harness.plan.finished import is_finished, is_obsolete
-from chronoscene.harness.plan.job import LOCKS, Job
+from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.plan import Plan, plan_runs
 from chronoscene.harness.plan.resolve import ResolvedRun
 from chronoscene.harness.plan.settings import BenchSettings
@@ -173,7 +173,7 @@ def _take(job: Job) -> Lock | None:
     The system frees the lock of a process that is killed.
     """
     runs = job.settings.runs
-    file = runs / LOCKS / job.folder.relative_to(runs)
+    file = runs / records.LOCKS / job.folder.relative_to(runs)
     file.parent.mkdir(parents=True, exist_ok=True)
     try:  # the thread that releases it may be another one
         return FileLock(f"{file}.lock", thread_local=False).acquire(blocking=False)

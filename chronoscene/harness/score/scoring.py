@@ -324,7 +324,7 @@ def rescore(
     if not folders:
         raise no_runs(runs, "no finished run in it")
     outcomes: list[Rescored] = []
-    readable = []
+    damaged = []
     for folder in folders:
         if progress is not None:
             progress(len(outcomes), len(folders))
@@ -332,11 +332,11 @@ def rescore(
             record = read_run(folder)
         except CheckpointError as error:
             outcomes.append(Rescored(folder, [], [], str(error)))
+            damaged.append(folder)
             continue
-        readable.append(folder)
         outcomes.append(_rescore_one(runs, folder, record, scorers))
-    if readable:
-        write_summary(runs, readable)
+    if len(damaged) < len(folders):
+        write_summary(runs, without=damaged)
     return outcomes
 
 

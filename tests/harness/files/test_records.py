@@ -3,11 +3,14 @@
 import csv
 import json
 import math
+import shutil
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
 from chronoscene.errors import CheckpointError
+from chronoscene.harness.files import records
 from chronoscene.harness.files.records import (
     Failure,
     ViewScore,
@@ -38,6 +41,24 @@ def test_infinite_psnr_is_plain_json(runs):
     assert read_rows(runs / JOINT) == rows
     write_summary(runs)
     json.loads((runs / "results.json").read_text(), parse_constant=refuse)
+
+
+def test_a_summary_has_the_runs_that_another_command_finishes_meanwhile(runs, monkeypatch):
+    others, again = [], runs / JOINT.replace("seed0", "seed1")
+
+    def read(folder):
+        if not others:  # the folders are listed by now
+            others.append(Thread(target=write_summary, args=[runs]))
+            shutil.copytree(runs / JOINT, again)
+            others[0].start()
+            others[0].join(0.2)
+        return read_run(folder)
+
+    monkeypatch.setattr(records, "read_run", read)
+    first = write_summary(runs)
+    others[0].join()
+    assert len(json.loads((runs / "results.json").read_text())) == len(first) + 1
+    assert len(write_summary(runs, without=[again])) == len(first)
 
 
 def test_the_summary_is_made_from_the_runs_alone(runs):

@@ -208,7 +208,7 @@ def test_variants_lie_side_by_side_and_are_named_by_what_differs(bench_here):
 
 def test_two_commands_share_a_folder_run_by_run(bench_here, tmp_path, monkeypatch):
     toy, runs = "toy_methods:MEAN", tmp_path / "runs"
-    other = FileLock(runs / runner.LOCKS / "ring/mean-joint-balanced/seed0.lock")
+    other = FileLock(runs / records.LOCKS / "ring/mean-joint-balanced/seed0.lock")
     Path(other.lock_file).parent.mkdir(parents=True)
     other.acquire()
 
