@@ -66,23 +66,36 @@ def import_extra(package: str, extra: str, place: str) -> Any:
         ) from error
 
 
-def load_entry(entry: EntryPoint, place: str) -> Any:
+def load_entry(entries: Iterable[EntryPoint], name: str, kind: str) -> Any:
     """Import what an entry point names; its package may be of another version, or broken.
 
     Args:
-        entry: Entry point of an installed package.
-        place: Kind and name of the plug-in, such as ``method mine``.
+        entries: Entry points of installed packages.
+        name: Of one of these.
+        kind: Of the plug-in, such as ``method``.
 
     Raises:
-        ConfigError: If the import fails.
+        ConfigError: If several packages have one of this name, or the import fails.
     """
+    entry, *others = [entry for entry in entries if entry.name == name]
+    package = _package(entry)
+    if others:
+        raise ConfigError(
+            f"{kind} {name}",
+            expected="one package that has it",
+            found=" and ".join([package, *map(_package, others)]),
+            todo="uninstall all but one",
+        )
     try:
         return entry.load()
     except Exception as error:  # whatever the code of others raises
-        package = entry.dist.name if entry.dist else entry.module
         raise ConfigError(
-            place,
+            f"{kind} {name}",
             expected=f"{entry.value}, which the package {package} names",
             found=f"{type(error).__name__}: {error}",
             todo=f"install what {package} needs, or another version of it, or uninstall it",
         ) from error
+
+
+def _package(entry: EntryPoint) -> str:
+    return entry.dist.name if entry.dist else entry.module

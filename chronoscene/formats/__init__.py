@@ -59,14 +59,14 @@ FAR_UP = 4
 
 
 @cache
-def _plugins() -> dict[str, EntryPoint]:
-    """Formats of other packages, by name."""
-    return {e.name: e for e in entry_points(group=ENTRY_POINT_GROUP) if e.name not in FORMATS}
+def _plugins() -> tuple[EntryPoint, ...]:
+    """Formats of other packages; our own names are taken."""
+    return tuple(e for e in entry_points(group=ENTRY_POINT_GROUP) if e.name not in FORMATS)
 
 
 def format_names() -> tuple[str, ...]:
     """Names of all formats, sorted."""
-    return tuple(sorted({*FORMATS, *_plugins()}))
+    return tuple(sorted({*FORMATS, *(entry.name for entry in _plugins())}))
 
 
 def load_format(name: str) -> Any:
@@ -76,15 +76,14 @@ def load_format(name: str) -> Any:
         ConfigError: If the format is unknown; lists the known ones. Or if it is of another package,
             and cannot be imported or lacks something.
     """
-    place = f"dataset format {name}"
     check_choice("dataset format", name, format_names())
     if name in FORMATS:
         return import_module(FORMATS[name])
-    module = load_entry(_plugins()[name], place)
+    module = load_entry(_plugins(), name, "dataset format")
     lacking = [needed for needed in REQUIRED if not hasattr(module, needed)]
     if lacking or name != module.NAME:
         raise ConfigError(
-            place,
+            f"dataset format {name}",
             expected=f"a module with {', '.join(REQUIRED)}, whose NAME is that of its entry point",
             found=f"no {lacking[0]}" if lacking else f"NAME = {module.NAME!r}",
             todo="correct the package as docs/guides/adding-a-format.md describes, or uninstall it",

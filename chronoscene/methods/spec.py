@@ -183,8 +183,12 @@ def method_names(group: str = ENTRY_POINT_GROUP) -> tuple[str, ...]:
 
 def installed_methods() -> dict[str, EntryPoint]:
     """Return the entry points of all methods, other programs among them, by name."""
-    path, groups = tuple(sys.path), (PROGRAM_GROUP, ENTRY_POINT_GROUP)
-    return {entry.name: entry for group in groups for entry in _entries(group, path)}
+    return {entry.name: entry for entry in _all_entries()}
+
+
+def _all_entries() -> tuple[EntryPoint, ...]:
+    path = tuple(sys.path)
+    return (*_entries(PROGRAM_GROUP, path), *_entries(ENTRY_POINT_GROUP, path))
 
 
 @cache
@@ -198,14 +202,13 @@ def load_spec(name: str) -> MethodSpec:
 
     Raises:
         ConfigError: If there is no such method; the message lists the known ones. Or if it is
-            installed, but cannot be imported.
+            installed, but by several packages, or cannot be imported.
     """
     if ":" in name:
         spec = import_object(name)
     else:
-        installed = installed_methods()
-        check_choice("--method", name, installed)
-        spec = load_entry(installed[name], f"method {name}")
+        check_choice("--method", name, installed_methods())
+        spec = load_entry(_all_entries(), name, "method")
     if not isinstance(spec, MethodSpec):
         raise ConfigError(
             name, expected="a MethodSpec", found=type(spec).__name__, todo="name its SPEC object"

@@ -137,12 +137,13 @@ def all_metrics() -> dict[str, MetricInfo]:
         ConfigError: If one of these cannot be imported, or is not what it should be.
     """
     found = dict(METRICS)
-    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda e: e.name):
-        info = load_entry(entry, f"metric {entry.name}")
-        if not isinstance(info, MetricInfo) or info.function is None or info.name != entry.name:
+    entries = entry_points(group=ENTRY_POINT_GROUP)
+    for name in sorted(entries.names):
+        info = load_entry(entries, name, "metric")
+        if not isinstance(info, MetricInfo) or info.function is None or info.name != name:
             raise ConfigError(
-                f"{ENTRY_POINT_GROUP}: {entry.name}",
-                expected=f"a MetricInfo of the name {entry.name}, with a function",
+                f"{ENTRY_POINT_GROUP}: {name}",
+                expected=f"a MetricInfo of the name {name}, with a function",
                 found=repr(info),
                 todo="correct the package, or uninstall it",
             )

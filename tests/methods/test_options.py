@@ -163,6 +163,13 @@ def test_an_installed_method_that_cannot_be_imported_is_named(monkeypatch, tmp_p
     assert f"found {found}" in str(error.value)
 
 
+def test_a_method_of_two_packages_is_neither(monkeypatch, tmp_path):
+    entries = {"3dgs": "no_such_package:SPEC"}
+    install(monkeypatch, tmp_path, {}, "chronoscene.methods", entries)
+    with pytest.raises(ConfigError, match=r"method 3dgs: expected one package .* plug-in.* and "):
+        load_spec("3dgs")
+
+
 def test_listing_methods_imports_nothing_heavy():
     code = (
         "import sys; from chronoscene.methods import load_spec, method_names\n"

@@ -95,10 +95,10 @@ def open_file(source: Source) -> HlocFile | ColmapDatabase:
 
 def load_plugin(option: str, source: Source) -> Any:
     """Load the object of an entry point."""
-    for entry in entry_points(group=GROUPS[option]):
-        if entry.name == source.place:
-            return load_entry(entry, f"{option} {entry.name}")
-    raise wrong(source.place, "an installed plug-in", "none of this name", "install it again")
+    entries = entry_points(group=GROUPS[option])
+    if all(entry.name != source.place for entry in entries):
+        raise wrong(source.place, "an installed plug-in", "none of this name", "install it again")
+    return load_entry(entries, source.place, option)
 
 
 def match_names(place: str, photos: Sequence[str], stored: Iterable[str]) -> dict[str, str]:
