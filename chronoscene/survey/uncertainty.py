@@ -105,7 +105,9 @@ def variance_of_mean(area: float, length: float, cells: int) -> float:
     return float(max(share, 1 / cells))
 
 
-UNKNOWN = Registration(0.0, f"unknown, and left out: there is no {CERTIFICATE} of this pair")
+UNKNOWN = Registration(
+    0.0, f"unknown, and left out: there is no {CERTIFICATE} of this pair, as register writes it"
+)
 
 
 def find_registration(

@@ -20,7 +20,8 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.geodesy import Georeference
 from chronoscene.scene import WorldFrame
-from chronoscene.survey import products
+from chronoscene.survey import difference, products
+from chronoscene.survey.uncertainty import UNKNOWN
 
 PLACE = Georeference(46.5, 11.35, 300.0, "as stated")
 
@@ -90,6 +91,14 @@ def test_all_products_of_a_run(site, tmp_path):
     cloud = laspy.read(out / "points_after_1.laz")
     assert (np.asarray(cloud["period"]) == 1).all() and len(cloud) > 500
     assert np.asarray(cloud.z).max() == pytest.approx(303, abs=0.05)
+
+
+def test_intervals_without_the_error_of_the_alignment_are_named(site, tmp_path, monkeypatch):
+    arguments = (site[0], "--resolution", "1", "--out")
+    assert "alignment" not in survey(*arguments, tmp_path / "known").stderr
+    monkeypatch.setattr(difference, "find_registration", lambda *_: UNKNOWN)
+    result = survey(*arguments, tmp_path / "unknown")
+    assert "before → after: error of the alignment unknown, and left out: there is" in result.stderr
 
 
 def test_two_runs_give_equal_files(site, tmp_path):

@@ -99,6 +99,8 @@ def _print(summary: Mapping[str, Any]) -> None:
             rows.append((name, v["polygon"], f"{v['area_m2']:,.0f}", *volumes))
         if pair["m3c2"] is None:
             say(f"no M3C2 of {name}: {pair['m3c2_absent']}", fg="yellow")
+        if (pair["m3c2"] or "volumes" in pair) and not pair["registration"]["sigma"]:
+            say(f"{name}: error of the alignment {pair['registration']['source']}", fg="yellow")
     if rows:
         names = ("periods", "polygon", "known, m²", "fill, m³", "cut, m³", "net, m³")
         title = "Volumes with their 95 % intervals"
