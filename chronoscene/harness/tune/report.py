@@ -122,6 +122,7 @@ def write_report(
             "failed": sum(result.psnr is None for result in results),
             "best_trial": best.number,
             "validation_psnr": best.psnr,
+            **({} if best.ssim is None else {"validation_ssim": best.ssim}),
             "device": best.device,
             "commit": best.commit,
         },

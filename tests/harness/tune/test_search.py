@@ -116,6 +116,7 @@ def test_the_first_trial_is_the_preset_and_the_best_one_becomes_a_preset(
     tuning = written["tuning"]
     assert tuning["trials"] == 4 and tuning["failed"] == 0 and tuning["best_trial"] == best.number
     assert [scene["name"] for scene in tuning["scenes"]] == ["ring"]
+    assert (tuning["validation_psnr"], tuning["validation_ssim"]) == (best.psnr, best.ssim)
 
     (folder,) = bench_here("toy_methods:TUNED", preset=str(path), validation=True)[0].finished
     assert folder.parent.name == "tuned-joint-preset-validation=true"
