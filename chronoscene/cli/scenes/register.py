@@ -77,8 +77,9 @@ FAILED = 1  # Exit status if a verdict is fail
 @click.option(
     "--cameras",
     type=EXISTING_FILE,
-    help="Known calibrations. Each line has a pattern of photo names, then model, width, height "
-    "and parameters as in COLMAP's cameras.txt. --route resection keeps them, others refine them.",
+    help="Known calibrations. Each line has a pattern of photo names as in OUT (with _ for blanks, "
+    "and .png where photos are converted), then model, width, height and parameters as in COLMAP's "
+    "cameras.txt. --route resection keeps them, others refine them.",
 )
 @click.option(
     "--camera-model",
@@ -204,6 +205,7 @@ def _check_together(options: Options, scene: Path | None) -> None:
         (("route", "calibration"), scene is not None, "with --into"),
         (("calibration", "camera_model"), options.cameras is not None, "with --cameras"),
         (("max_image_size", "max_features"), options.features is not None, "with --features"),
+        (("exhaustive_limit",), Path(options.matches or "").is_file(), "with a file of --matches"),
         (("tie_scale",), options.tie_points is None, "without --tie-points"),
     ):
         if applies:

@@ -212,6 +212,7 @@ def test_control_is_checked_before_any_work(
         ("--camera-model", "OPENCV", "--cameras", "with --cameras"),
         ("--max-image-size", "800", "--features", "with --features"),
         ("--max-features", "900", "--features", "with --features"),
+        ("--exhaustive-limit", "9", "--matches", "with a file of --matches"),
         ("--tie-scale", "0.5", None, "without --tie-points"),
     ],
 )
