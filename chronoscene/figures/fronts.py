@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, exp, log
+from math import ceil, dist, exp, log
 from pathlib import Path
 from textwrap import fill, wrap
 from typing import Any
@@ -21,6 +21,9 @@ LEGEND_LINE, LEGEND_COLUMN = 0.155, 4.0  # Inches
 LETTERS, NOTE_LETTER = 46, 0.06  # Of a title on one line; width of one of the note in inches
 MANY_TICKS = 15  # Factor between the ends of an axis from which on few of its ticks have numbers
 DISC = 9.0  # Diameter in points of the discs with numbers
+AXES = (155.0, 122.0)  # Width and height of the axes of a panel, about, in points
+HIDDEN = 0.8  # Diameters between two discs below which one hides the number of the other
+FARTHEST = 4  # Diameters by which a disc may be moved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,8 +131,9 @@ def _draw_panel(axes: Any, panel: Panel, colors: Mapping[int, str]) -> None:
         linewidth=1.1,
         zorder=1,
     )
+    shifts = _shifts(panel.marks, low, high)
     for mark in panel.marks:
-        _draw_mark(axes, mark, colors[mark.number])
+        _draw_mark(axes, mark, colors[mark.number], shifts[mark.number])
     axes.margins(y=0.14)
     if panel.lower_is_better:
         axes.invert_yaxis()
@@ -143,8 +147,33 @@ def _limits(marks: Sequence[Mark]) -> tuple[float, float]:
     return low / exp(margin), high * exp(margin)
 
 
-def _draw_mark(axes: Any, mark: Mark, color: str) -> None:
+def _shifts(marks: Sequence[Mark], low: float, high: float) -> dict[int, float]:
+    """Move discs that would hide others to the side of them, in points, by the number.
+
+    Those on the front stay first. ``low`` and ``high``: limits of the axis of the costs.
+    """
+    ends = [mark.y + side * mark.y_spread for mark in marks for side in (-1, 1)]
+    width, height = AXES[0] / log(high / low), AXES[1] / max(1.28 * (max(ends) - min(ends)), 1e-9)
+    shifts: dict[int, float] = {}
+    taken: list[tuple[float, float]] = []
+    for mark in sorted(marks, key=lambda mark: not mark.on_front):
+        x, y = width * log(mark.x / low), height * mark.y
+        shifts[mark.number] = 0.0
+        for steps in sorted(range(-FARTHEST, FARTHEST + 1), key=abs):
+            place = (x + DISC * steps, y)
+            clear = all(dist(place, other) >= HIDDEN * DISC for other in taken)
+            if clear and 0 <= place[0] <= AXES[0]:
+                shifts[mark.number] = DISC * steps
+                break
+        taken.append((x + shifts[mark.number], y))
+    return shifts
+
+
+def _draw_mark(axes: Any, mark: Mark, color: str, shift: float) -> None:
     """Draw a disc with its number; white with a coloured rim off the front."""
+    from matplotlib.transforms import ScaledTranslation
+
+    there = ScaledTranslation(shift / 72, 0, axes.figure.dpi_scale_trans)
     face = color if mark.on_front else "white"
     # Those on the front lie above the others, and each disc with its number above the one before.
     level = 2 + mark.on_front + mark.number / 1e4
@@ -159,11 +188,20 @@ def _draw_mark(axes: Any, mark: Mark, color: str) -> None:
     )
     style = {"markerfacecolor": face, "markeredgecolor": color, "markeredgewidth": 0.9}
     axes.plot(
-        mark.x, mark.y, "o", markersize=DISC, zorder=level, gid=f"mark-{mark.number}", **style
+        mark.x,
+        mark.y,
+        "o",
+        markersize=DISC,
+        zorder=level,
+        gid=f"mark-{mark.number}",
+        transform=axes.transData + there,
+        **style,
     )
     axes.annotate(
         str(mark.number),
         (mark.x, mark.y),
+        xytext=(shift, 0),
+        textcoords="offset points",
         ha="center",
         va="center_baseline",
         fontsize=6,

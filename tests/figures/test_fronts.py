@@ -8,7 +8,16 @@ import pytest
 from PIL import Image
 
 from chronoscene.figures.canvas import EIGHT
-from chronoscene.figures.fronts import Mark, Panel, _draw_panel, _limits, draw_fronts, panel_svg
+from chronoscene.figures.fronts import (
+    DISC,
+    Mark,
+    Panel,
+    _draw_panel,
+    _limits,
+    _shifts,
+    draw_fronts,
+    panel_svg,
+)
 
 MARKS = [
     Mark(number=1, x=1.0, y=20.0, x_spread=0.1, y_spread=0.5, on_front=True),
@@ -67,6 +76,17 @@ def test_costs_that_hardly_differ_are_not_spread():
     assert high / low == pytest.approx(2) and low * high == pytest.approx(90.02**2)
     low, high = _limits([on_axis(1.0, 3.0), on_axis(50.0, 5.0)])
     assert 0 < low < 0.5 and high > 55
+
+
+def test_discs_do_not_hide_each_other():
+    there = [replace(MARKS[2], number=number, x=9.0, y=25.0) for number in (3, 4, 5)]
+    marks = [MARKS[0], *there, MARKS[1]]
+    shifts = _shifts(marks, *_limits(marks))
+    assert shifts[1] == shifts[2] == 0, "the front stays where it is"
+    assert sorted(abs(shifts[i]) for i in (3, 4, 5)) == [DISC, DISC, 2 * DISC]
+    crowd = [replace(MARKS[1], number=number) for number in range(1, 30)]
+    low, high = _limits(crowd)
+    assert 0.0 in _shifts(crowd, low, high).values()
 
 
 def test_a_panel_in_a_page_has_text_titles_and_equal_bytes():

@@ -171,7 +171,7 @@ def draw(points: DataFrame, path: Path, records: Sequence[RunRecord]) -> None:
     commits = ", ".join(dict.fromkeys(run.commit for run in records))
     note = (
         "Test views, means over periods. Filled: on the Pareto front, which the line follows. "
-        "Bars: standard deviation over seeds."
+        "Bars: standard deviation over seeds. Discs that would hide others are beside them."
         f"\nDevice: {devices}. Code: {commits}."
     )
     draw_fronts(rows, path, names=names, groups=groups, note=note)
