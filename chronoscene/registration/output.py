@@ -50,7 +50,7 @@ def as_scene(registered: Registered, name: str) -> Scene:
     )
     photos = Path(registered.images_root)
     georeference = registered.georeference
-    world = WorldFrame() if georeference is None else WorldFrame("metre", georeference.crs)
+    world = WorldFrame(registered.unit, None if georeference is None else georeference.crs)
     return Scene(
         name=name,
         root=photos,

@@ -59,7 +59,7 @@ class Resection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """One model of all periods, in metres if georeferenced.
+    """One model of all periods, in metres if georeferenced or moved to ground control.
 
     N registered images, P points, O observations.
     """
@@ -92,7 +92,7 @@ class Registered:
     gps_used: Mask
     """True if the position took part in the estimation. [N]"""
     georeference: Georeference | None
-    """None if the frame is arbitrary, and with it its scale."""
+    """None if the place in the world is unknown."""
     num_periods: int
     labels: tuple[str, ...]
     dates: tuple[str | None, ...]
@@ -114,11 +114,13 @@ class Registered:
     """Name of the features and matches."""
     resection: Resection | None = None
     """Precision of poses that surveyed points fix."""
+    local_metres: bool = False
+    """True if the frame is that of ground control without a reference system."""
 
     @property
     def unit(self) -> str:
         """``metre``, or ``unknown``."""
-        return "unknown" if self.georeference is None else "metre"
+        return "unknown" if self.georeference is None and not self.local_metres else "metre"
 
     def counts(self) -> list[dict[str, Any]]:
         """Count the photos of each period, those that cannot be used among them."""

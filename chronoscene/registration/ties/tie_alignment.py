@@ -109,6 +109,8 @@ def align_with_tie_points(
         there = replace(there, georeference=replace(frame, height_kind="as stated"))
         if model.georeference is None:
             there = replace(there, gps_enu=np.full_like(model.gps_enu, np.nan))
+    if used and frame is None:
+        there = replace(there, local_metres=True)
     if not used and model.georeference is None:
         known = {}  # the place of the model is unknown
 

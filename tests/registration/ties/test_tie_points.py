@@ -11,12 +11,14 @@ import pytest
 
 from benchmarks.registration.generated import CaseSettings, Generated, generate_case, pose_errors
 from chronoscene.errors import SceneError
+from chronoscene.registration.output import as_scene
 from chronoscene.registration.photos.inputs import plain_names
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.ties.residuals import with_tie_tracks
 from chronoscene.registration.ties.tie_alignment import align_with_tie_points, move_periods
 from chronoscene.registration.ties.tie_points import TiePoints, by_photo, read_tie_points
+from chronoscene.scene import WorldFrame
 from chronoscene.scene.similarity import Sim3
 
 CORNERS = np.array(
@@ -298,6 +300,8 @@ def test_ground_control_moves_the_model(tmp_path: Path) -> None:
     )
     found = align_with_tie_points(model, read(tmp_path, clicks(made, control=True)))
     assert found.controlled and not found.replaced
+    assert (model.unit, found.model.unit) == ("unknown", "metre")
+    assert as_scene(found.model, "site").world == WorldFrame("metre")
     from chronoscene.scene.geometry import camera_centre
 
     gap = camera_centre(found.model.cam_from_world) - camera_centre(made.truth)
