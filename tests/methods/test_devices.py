@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -54,6 +54,16 @@ QUESTIONS = 3
 fields: how many samples there are, how many are seen; and how the step went."""
 MORE_QUESTIONS = {"ha-nerf": 1, "ha-nerf-t": 1}
 """The photos that have been drawn have to be encoded."""
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Sums of torch have other bits on one processor: a Gaussian of 4dgs ends so close to the
+    opacity below which none is drawn that only one of both ways draws it."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
 
 
 @dataclass
@@ -188,6 +198,7 @@ def test_first_steps_are_those_of_the_compiled_code(
     np.testing.assert_allclose(compiled.image(method), image, atol=IMAGE_TOLERANCE[device])
 
 
+@pytest.mark.usefixtures("two_threads")
 def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
     compiled: Compiled,
     training: Training,
