@@ -20,9 +20,10 @@ from pathlib import Path
 
 from chronoscene.colmap.model import PosedImage
 from chronoscene.colmap.raw_model import FoundModel
+from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared import colmap_layout, transforms
-from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
+from chronoscene.formats.shared.grouping import OPTION, group_labels, natural_key, rule_error
 from chronoscene.formats.shared.ply import read_points
 from chronoscene.formats.shared.transforms import CameraTable
 from chronoscene.images.store import ImageSource, Progress
@@ -70,7 +71,12 @@ def read(path: Path, *, period_by: str = "step", model: FoundModel | None = None
 def assign(images: Path, names: list[str], *, period_by: str = "step") -> colmap_layout.Assigned:
     """Periods and test images of a real scene by the names of the images."""
     if period_by != "step":
-        raise rule_error(period_by, ["step"])
+        raise ConfigError(
+            OPTION,
+            expected="step, as the images are named day_<n>_...",
+            found=repr(period_by),
+            todo="leave it out: changes are those of rendered levels",
+        )
     steps = {name: _step(name) for name in names}
     order = sorted(set(steps.values()), key=natural_key)
     rule = f"every {TEST_EVERY}th image of all in name order (index 0, {TEST_EVERY}, ...)"

@@ -55,6 +55,11 @@ def test_base_and_one_change(level):
         read_scene(folder, period_by="change:delete")
 
 
+def test_photos_of_days_have_no_changes(colmap_folder):
+    with pytest.raises(ConfigError, match="expected step, as the images are named day_<n>"):
+        read_scene(colmap_folder(REAL), period_by="change:add")
+
+
 def test_test_file_decides(level):
     folder = level(("add",))
     data = json.loads((folder / "add/transforms_train.json").read_text())

@@ -86,7 +86,7 @@ def report(done: Undistortion) -> str:
 def _describe_change(change: CameraChange) -> str:
     source, target = change.source, change.target
     fx, fy, cx, cy = target.params
-    what = "images copied" if change.is_copy else "images resampled"
+    what = "images unchanged" if change.is_copy else "images resampled"
     return (
         f"camera {target.camera_id}: {source.model} {source.width} x {source.height} -> PINHOLE "
         f"{target.width} x {target.height}, f {fx:.2f} {fy:.2f}, c {cx:.2f} {cy:.2f}; {what}"

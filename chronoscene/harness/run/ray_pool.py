@@ -27,6 +27,7 @@ from chronoscene.harness.plan.settings import BenchSettings
 from chronoscene.harness.run.process import put_in_place, run_staged, staged
 from chronoscene.io.processes import Report, Stop
 from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.wording import counted, joined
 from chronoscene.methods import load_spec
 
 PATIENCE = 1.0  # Seconds from one look at a run to the next
@@ -137,10 +138,11 @@ class RayPool:
             "GPU": int(self._on_gpu(job)),
         }
         if not any(all(m.get(k, 0) >= n for k, n in needs.items()) for m in self._machines):
+            wanted = [counted(needs["CPU"], "processor"), f"{job.memory / 1e9:.2f} GB of memory"]
+            wanted += ["a GPU"] * needs["GPU"]
             raise BackendError(
                 self._option,
-                expected=f"a machine with {needs['CPU']} processors, {job.memory / 1e9:.2f} GB of "
-                f"memory and {needs['GPU']} GPUs",
+                expected=f"a machine with {joined(wanted)}",
                 found="none",
                 todo="use --threads, --job-memory or --device",
             )

@@ -61,7 +61,7 @@ def test_names_what_is_left_out(make_scene_folder, tmp_path):
 
 
 def test_says_that_nothing_had_to_be_done(make_scene_folder, tmp_path):
-    assert "images copied" in run(make_scene_folder(), tmp_path / "out").stdout
+    assert "images unchanged" in run(make_scene_folder(), tmp_path / "out").stdout
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,8 @@ def test_a_run_that_fails_stops_nobody_else(on_ray):
     )
     assert said[-1].startswith("5 of 5 runs, 0 under way, ")
     outcome, _ = on_ray("MEAN", threads=5, seeds=(1,))
-    assert "expected a machine with 5 processors, 0.10 GB" in outcome.failures[0].reason
+    wanted = "expected a machine with 5 processors and 0.10 GB of memory, found none"
+    assert wanted in outcome.failures[0].reason
 
 
 @pytest.mark.slow
