@@ -1,7 +1,7 @@
 """A certificate as ``registration.json``, and as rows of a table.
 
-Every figure stands with its unit and the number of things it was taken over; one that could not be
-computed is ``null``, with the reason beside it.
+Every figure stands with its unit and with what it was taken over; one that could not be computed is
+``null``, with the reason beside it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Figure:
     value: float | None
     unit: str
     over: str
-    """Kind and number of the items that it is computed from."""
+    """What it is computed from, with the number where there is one."""
     absent: str | None = field(default=None, kw_only=True)
     """Reason why there is no value."""
     interval: tuple[float, float] | None = field(default=None, kw_only=True)
@@ -50,11 +50,13 @@ class Figure:
         """Value with unit and interval, for people."""
         if self.value is None:
             return f"absent: {self.absent}"
-        number = f"{self.value:,.0f}" if abs(self.value) >= 1000 else f"{self.value:.3g}"
+        digits = 3 if self.unit else 6  # A scale is 1 but for parts in a thousand
+        number = f"{self.value:,.0f}" if abs(self.value) >= 1000 else f"{self.value:.{digits}g}"
         unit = f" {self.unit}" if self.unit else ""
         if self.interval is None:
             return number + unit
-        return f"{number}{unit} ({self.interval[0]:.2g} to {self.interval[1]:.2g})"
+        low, high = (f"{end:.{digits - 1}g}" for end in self.interval)
+        return f"{number}{unit} ({low} to {high})"
 
 
 def period_figures(period: PeriodFigures) -> Iterator[Figure]:
@@ -115,14 +117,15 @@ def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure
         ("by held-out tracks and ties", pair.by_all),
     ):
         yield from _misalignment_figures(certificate, name, found, unit)
-    for name, both in (
-        ("by surfaces", pair.by_surfaces),
-        ("by held-out tracks and surfaces", pair.independent),
-        ("by held-out tracks, ties and surfaces", pair.by_ties_and_surfaces),
+    combined = "agreeing tracks, core points"
+    for name, both, over in (
+        ("by surfaces", pair.by_surfaces, "core points"),
+        ("by held-out tracks and surfaces", pair.independent, combined),
+        ("by held-out tracks, ties and surfaces", pair.by_ties_and_surfaces, combined),
     ):
         if both is not None:
-            yield _interval(f"rotation {name}", both[0], "degrees", "agreeing tracks, core points")
-            yield _interval(f"displacement {name}", both[1], unit, "agreeing tracks, core points")
+            yield _interval(f"rotation {name}", both[0], "degrees", over)
+            yield _interval(f"displacement {name}", both[1], unit, over)
     for name, other, local in (
         (names[1], names[0], pair.localised_b),
         (names[0], names[1], pair.localised_a),

@@ -53,7 +53,7 @@ def contradictions(names: Sequence[str], source: Array, target: Array) -> list[s
     Args:
         names: [N]
         source: Places in the model. [N, 3]
-        target: Surveyed coordinates. [N, 3]
+        target: Surveyed coordinates in metres. [N, 3]
     """
     whole = fit(source, target)
     if whole is None or len(names) < 4:
@@ -68,7 +68,9 @@ def contradictions(names: Sequence[str], source: Array, target: Array) -> list[s
         errors = without.apply(source) - target
         own, others = float(np.linalg.norm(errors[i])), _rms(errors[rest])
         if others * AGREEING < before and own > AGREEING * others:
-            found.append((others, f"{name} is {own:.3g} off, and the others fit to {others:.2g}"))
+            found.append(
+                (others, f"{name} is {own:.3g} m off, and the others fit to {others:.2g} m")
+            )
     return [text for _, text in sorted(found)]
 
 

@@ -31,7 +31,12 @@ from chronoscene.registration.quality.rays import PlacedPoints, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.quality.thresholds import THRESHOLDS
 from chronoscene.registration.quality.verdict import judge
-from chronoscene.registration.report.certificate_json import pair_figures, period_figures, to_json
+from chronoscene.registration.report.certificate_json import (
+    Figure,
+    pair_figures,
+    period_figures,
+    to_json,
+)
 from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene import Camera
 from chronoscene.scene.geometry import camera_centre
@@ -277,6 +282,13 @@ def test_json_has_units_numbers_and_reasons(certificate: Certificate) -> None:
             assert (figure["value"] is None) == bool(figure["absent"]), figure
     assert len(data["thresholds"]) == len(THRESHOLDS)
     assert len(list(period_figures(certificate.periods[0]))) >= 6
+
+
+def test_scales_are_shown_as_far_as_they_differ_from_1() -> None:
+    scale = Figure("scale against own GPS", 1.000312, "", "", interval=(0.99871, 1.00192))
+    assert scale.text == "1.00031 (0.99871 to 1.0019)"
+    size = Figure("level of detection, median", 0.123456, "m", "", interval=(0.10441, 0.15))
+    assert size.text == "0.123 m (0.1 to 0.15)"
 
 
 @pytest.mark.parametrize("key", THRESHOLDS)

@@ -83,7 +83,7 @@ def _find(option: str, text: str) -> Source:
             version = "" if package is None else f"{package.name} {package.version}"
             return Source("plug-in", text, version)
     known = sorted(entry.name for entry in entry_points(group=GROUPS[option]))
-    expected = f"a file, or one of: {', '.join(known) or '(none)'}"
+    expected = f"a file, or an installed plug-in ({', '.join(known) or 'there is none'})"
     todo = f"correct it; plug-ins are entry points of the group {GROUPS[option]}"
     raise ConfigError(option, expected=expected, found=repr(text), todo=todo)
 

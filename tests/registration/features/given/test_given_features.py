@@ -141,7 +141,7 @@ def test_installed_extractors_and_matchers(
     assert read(captures / name, None)[1].dtype == np.float32
     both = [features[n] for n in sorted(features)[:2]]
     assert tasks.matcher(given)(*both).tolist() == [[0, 3], [1, 2]]
-    with pytest.raises(ConfigError, match=r"one of: mine; found|one of: mine, found 'other'"):
+    with pytest.raises(ConfigError, match=r"an installed plug-in \(mine\), found 'other'"):
         find_sources("other", None)
 
 
