@@ -32,9 +32,10 @@ class Threshold:
         return "doubtful" if sign * value > sign * self.doubtful else "pass"
 
 
+AGAIN = "run again with --tie-points"
 CLICK = (
-    "mark points that both dates show with chronoscene mark (--report may suggest spots), and run "
-    "again with --tie-points"
+    "mark points that both dates show with chronoscene mark (--report may suggest spots), and "
+    f"{AGAIN}"
 )
 LOOK = (
     "look at the comparisons on the page (--report); if flat ground that did not change jumps in "

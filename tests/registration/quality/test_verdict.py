@@ -621,6 +621,15 @@ def test_the_worst_comes_first_and_is_what_the_text_names() -> None:
     assert "do not prove it" in doubtful.text
 
 
+def test_what_to_do_is_said_once_and_can_be_done() -> None:
+    turned = with_part(made(), "by_all", rotation=Interval(0.4, 0.2, 0.6))
+    both = with_part(turned, "surfaces", beyond=0.4)
+    (todo,) = judge(both).todo
+    assert todo.startswith("look at the comparisons") and todo.endswith("again with --tie-points")
+    (extended,) = judge(replace(both, route="frozen")).todo
+    assert extended.endswith("register all dates together, without --into, with --tie-points")
+
+
 def test_a_row_that_is_not_proven_is_told_what_to_photograph() -> None:
     assert judge(with_period(made(), in_three=0.4)).level == "pass"  # no doubt by itself
     few = with_part(made(), "ties", tied_a=0.4)
