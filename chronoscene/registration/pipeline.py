@@ -20,6 +20,7 @@ from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.control.route import check_options, resect_photos
 from chronoscene.registration.features.correspondences import find_matches
+from chronoscene.registration.features.given.source import find_sources
 from chronoscene.registration.output import Inspection, inspect_registration
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import PhotoInputs, gather
@@ -62,8 +63,8 @@ def run(
             computed is kept in the work folder.
         SceneError: If ``out`` is in use, tie points do not suffice, have no clicks or do not say
             in which photos, or ``into`` has distortion.
-        ConfigError: If tie points are given together with ``into``, or the reference system is
-            unsuitable.
+        ConfigError: If tie points are given together with ``into``, the reference system is
+            unsuitable, or given features are not there.
     """
     options = options or Options()
     out = Path(out)
@@ -75,6 +76,7 @@ def run(
             todo="omit one of the two",
         )
     check_options(options)
+    find_sources(options.features, options.matches)  # errors in these come before any work
     output.check_free(out, overwrite=options.overwrite)
     work = options.work_folder(out)
     crs = None if options.crs is None else read_projected("--crs", options.crs)

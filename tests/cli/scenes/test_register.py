@@ -226,6 +226,12 @@ def test_options_without_an_effect_are_refused(
     assert not (tmp_path / "out.work").exists()
 
 
+def test_features_that_are_not_there_are_refused_before_any_work(tmp_path: Path) -> None:
+    done = call(photos(tmp_path / "in/a", 3), tmp_path / "out", "--features", "nope.h5")
+    assert str(done.exception).startswith("--features: expected a file, or an installed plug-in (")
+    assert not (tmp_path / "out.work").exists()
+
+
 def test_a_click_that_may_mean_either_of_two_photos_is_refused_before_features(
     tmp_path: Path,
 ) -> None:
