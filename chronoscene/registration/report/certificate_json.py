@@ -39,7 +39,7 @@ class Figure:
     value: float | None
     unit: str
     over: str
-    """What it is computed from, with the number where there is one."""
+    """Kind of the items that it is computed from, with their number where it is known."""
     absent: str | None = field(default=None, kw_only=True)
     """Reason why there is no value."""
     interval: tuple[float, float] | None = field(default=None, kw_only=True)
