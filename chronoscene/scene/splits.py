@@ -215,7 +215,7 @@ def _place(
         found_period = f"period {entry.period}"
         todo = "keep one of the two lines"
         return Problem("contradiction", entry.line, expected, found_period, todo)
-    return Problem("duplicate", entry.line, "each image once", f"{name!r} as in {lines[name]}")
+    return Problem("duplicate", entry.line, "each image once", f"{name!r} as in line {lines[name]}")
 
 
 def _not_one(entry: SplitEntry | NameEntry, found: list[str]) -> Problem:

@@ -94,7 +94,7 @@ def test_split_contradiction(scene):
 
 def test_split_duplicate(scene):
     scene.write(SPLIT, [*scene.lines(SPLIT), "a001 0"])
-    scene.expect("CS308", place=f"{SPLIT}:19", found="'a001.png' as in 2")
+    scene.expect("CS308", place=f"{SPLIT}:19", found="'a001.png' as in line 2")
 
 
 def test_split_unknown(scene):
