@@ -55,7 +55,11 @@ def command(
     """
     system = None if crs is None else read_projected("--crs", crs)
     check_outside(out, [source], option="OUT")
+    frame = None
     with progress_bar(f"read {source}") as bar:
+        if system is not None:  # before OUT is written, which would be in the way of a second try
+            world = read_scene(source, format=dataset_format, period_by=period_by).world
+            frame = _local_frame(world)
         done = convert(
             source,
             out,
@@ -69,7 +73,7 @@ def command(
     # OUT may have other names of images and another split than SRC.
     scene = read_scene(out, format=target)
     if system is not None:
-        write_coordinates(out, scene, _local_frame(scene.world, out), system)
+        write_coordinates(out, scene, frame, system)
     lines = [f"{out}: {target} from {done.scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")
@@ -78,7 +82,7 @@ def command(
         show_note(warning)
 
 
-def _local_frame(world: WorldFrame, out: Path) -> Georeference:
+def _local_frame(world: WorldFrame) -> Georeference:
     """Return the local frame of a registration that world coordinates are in.
 
     Raises:
@@ -94,6 +98,6 @@ def _local_frame(world: WorldFrame, out: Path) -> Georeference:
     raise ConfigError(
         "--crs",
         expected="a georeferenced scene in the local frame of register, without an offset",
-        found=f"{found}: {out} was written without coordinates",
+        found=found,
         todo=todo,
     )

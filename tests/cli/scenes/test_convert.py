@@ -132,7 +132,7 @@ def test_coordinates_are_not_written_without_the_offset(make_scene_folder, tmp_p
     ) as error:
         run(folder, tmp_path / "out", "--crs", "EPSG:32632")
     assert f"{world['crs']} with the offset" in str(error.value)
-    assert not (tmp_path / "out/cameras.csv").exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_help_lists_formats_and_groupings():
