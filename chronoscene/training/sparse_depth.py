@@ -59,8 +59,8 @@ class SparseDepth:
     def __init__(self, weight: float, train: TrainingSet, device: torch.device) -> None:
         self.weight, self._train, self._device = weight, train, device
         self._kept: dict[int, DepthTarget] = {}
-        views = range(len(train.views)) if weight else ()
-        if weight and not any(len(train.load_depths(number).pixels) for number in views):
+        numbers = range(len(train.views))
+        if weight and not any(len(train.load_depths(number).pixels) for number in numbers):
             raise SceneError(
                 "sparse points",
                 expected="points that at least 3 images observe, for depth_weight",
