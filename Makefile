@@ -53,6 +53,10 @@ leaderboard: $(READY)
 	rm -rf $(SITE)
 	$(BIN)/chronoscene leaderboard leaderboard/entries/measured --out $(SITE) $(RUNS:%=--runs %)
 
+# Each process of tests has a thread for each processor. Threads that wait actively keep those from
+# running that they wait for: trainings with two threads on one processor took 20 times as long.
+test: export OMP_WAIT_POLICY := PASSIVE
+test: export OPENBLAS_NUM_THREADS := 1
 test: $(READY)
 	@$(MAKE) --no-print-directory --jobs=2 lint gaussian-kernels other-kernels
 	$(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
