@@ -50,7 +50,9 @@ def workers_of(pid):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_path, monkeypatch):
+def test_a_killed_bench_keeps_what_is_finished_and_goes_on(
+    bench_here, scene_folder, tmp_path, monkeypatch
+):
     runs, hold = tmp_path / "runs", tmp_path / "hold"
     hold.touch()
     monkeypatch.setenv("TOY_HOLD", f"1:{hold}")
@@ -69,8 +71,8 @@ def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_pat
     wait_for(lambda: not Path(f"/proc/{worker}").exists())
     assert half_done[0].parent.exists()
     hold.unlink()
-    again = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "1 of 2 runs are finished and kept" in again.stdout
+    _, said = bench_here("MEAN", threads=1, seeds=(0, 1), iterations=20, overwrite=True)
+    assert "1 of 2 runs are finished and kept" in said
     assert done.read_bytes() == before
     assert [p.name for p in run_folders(runs)] == ["seed0", "seed1"]
     assert not list(runs.rglob("*.partial"))
