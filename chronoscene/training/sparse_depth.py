@@ -19,6 +19,23 @@ INTERVAL = 4
 """Every so many views one has the term, as drawing depth takes as long as drawing colours."""
 
 
+def check_depths(train: TrainingSet) -> None:
+    """Check that there is something to compare with.
+
+    Raises:
+        SceneError: If no view has a sparse depth.
+    """
+    if any(len(train.load_depths(number).pixels) for number in range(len(train.views))):
+        return
+    raise SceneError(
+        "sparse points",
+        expected="points that at least 3 images observe, for depth_weight",
+        found="none in the training images",
+        todo="triangulate some (chronoscene triangulate), or set depth_weight=0, as preset "
+        "balanced does",
+    )
+
+
 class DepthTarget(NamedTuple):
     """Depths of sparse points in the view of a step."""
 
@@ -51,23 +68,11 @@ class SparseDepth:
         weight: Mean weight of the term; 0: there is none.
         train: Has the depths.
         device: Of the tensors.
-
-    Raises:
-        SceneError: If they are asked for, and no view has any.
     """
 
     def __init__(self, weight: float, train: TrainingSet, device: torch.device) -> None:
         self.weight, self._train, self._device = weight, train, device
         self._kept: dict[int, DepthTarget] = {}
-        numbers = range(len(train.views))
-        if weight and not any(len(train.load_depths(number).pixels) for number in numbers):
-            raise SceneError(
-                "sparse points",
-                expected="points that at least 3 images observe, for depth_weight",
-                found="none in the training images",
-                todo="triangulate some (chronoscene triangulate), or set depth_weight=0, as preset "
-                "balanced does",
-            )
 
     def target(self, number: int, drawn: int) -> DepthTarget | None:
         """Return that of a view; None where the step has no such term, or the view no points.
