@@ -61,7 +61,7 @@ class Drawn(NamedTuple):
     """uint8 [H, W, 3]"""
     mask: Tensor | None
     """bool [H, W]"""
-    target: DepthTarget | None
+    target: DepthTarget | None = None
     """Depths to compare with."""
 
 
