@@ -24,7 +24,7 @@ def pairs():
             yield pytest.param(extreme, name, id=f"{extreme.name}-{name}", marks=marks)
 
 
-@pytest.mark.parametrize(("extreme", "name"), pairs())
+@pytest.mark.parametrize(("extreme", "name"), list(pairs()))
 def test_a_training_ends_in_a_model_or_in_one_clear_error(extreme, name):
     outcome = extreme_trainings.run(extreme, load_spec(name), "fast")
     assert outcome.clear, outcome.error
