@@ -53,9 +53,8 @@ leaderboard: $(READY)
 	rm -rf $(SITE)
 	$(BIN)/chronoscene leaderboard leaderboard/entries/measured --out $(SITE) $(RUNS:%=--runs %)
 
-# Each process of tests has a thread for each processor. Threads that wait actively keep those from
-# running that they wait for: trainings with two threads on one processor took 20 times as long.
-test: export OMP_WAIT_POLICY := PASSIVE
+# The threads of OpenBLAS wait actively, and keep those from running that they wait for: beside two
+# busy processes on two processors, 300 products of 150x150 matrices took 4.8 s, and 0.04 s so.
 test: export OPENBLAS_NUM_THREADS := 1
 test: $(READY)
 	@$(MAKE) --no-print-directory --jobs=2 lint gaussian-kernels other-kernels
