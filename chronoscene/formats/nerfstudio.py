@@ -43,6 +43,7 @@ from chronoscene.images.masks import mask_place
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.documents import json_error, number, read_json_document
 from chronoscene.io.staging import staged_folder
+from chronoscene.io.wording import counted
 from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
 from chronoscene.scene.cameras import way_to_pinhole
 from chronoscene.scene.similarity import Sim3
@@ -128,9 +129,9 @@ def remarks(path: Path) -> list[str]:
         found.append(f"{COLMAP} is not read, which has observations of points")
     images = _read_images(file)
     if missing := len(file.frames) - len(images):
-        found.append(f"{missing} frames are left out, as their image is missing")
+        found.append(f"{counted(missing, 'frame')} left out: no image")
     if unlisted := len(images) - len(_apply_lists(file, images)[0]):
-        found.append(f"{unlisted} frames are left out, as no list names them")
+        found.append(f"{counted(unlisted, 'frame')} left out: in no list")
     return found
 
 

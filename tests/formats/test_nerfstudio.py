@@ -155,7 +155,7 @@ def test_lists_of_names(nerfstudio_folder):
         ("1.png", "train"),
         ("3.png", "test"),
     ]
-    assert nerfstudio.remarks(folder) == ["1 frames are left out, as no list names them"]
+    assert nerfstudio.remarks(folder) == ["1 frame left out: in no list"]
     edit(folder, val_filenames=images[:1])
     with pytest.raises(SceneError, match=r"without common names, found 'images/0.png'"):
         read_scene(folder)
@@ -184,7 +184,7 @@ def test_frames_without_image_are_left_out(nerfstudio_folder):
     folder = nerfstudio_folder(NAMES)
     (folder / "images/2.png").unlink()
     assert [f.name for f in read_scene(folder).frames] == ["0.png", "1.png", "3.png"]
-    assert "1 frames are left out, as their image is missing" in nerfstudio.remarks(folder)
+    assert "1 frame left out: no image" in nerfstudio.remarks(folder)
     for name in NAMES:
         (folder / "images" / name).unlink(missing_ok=True)
     with pytest.raises(SceneError, match="expected an image, found nothing"):
@@ -240,7 +240,7 @@ def test_frames_without_image_are_left_out_where_images_say_the_size(nerfstudio_
         ("3.png", "train"),
     ]
     assert (scene.frames[0].camera.width, scene.frames[0].camera.height) == (64, 48)
-    assert "1 frames are left out, as their image is missing" in nerfstudio.remarks(folder)
+    assert "1 frame left out: no image" in nerfstudio.remarks(folder)
 
 
 def test_names_that_no_disk_can_hold_count_as_missing(nerfstudio_folder):

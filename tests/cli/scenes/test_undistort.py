@@ -57,7 +57,7 @@ def test_names_what_is_left_out(make_scene_folder, tmp_path):
     convert(make_scene_folder(), tmp_path / "other", target="nerfstudio")
     (tmp_path / "other/images/a/0002.png").unlink()
     result = run(tmp_path / "other", tmp_path / "out")
-    assert "note: 1 frames are left out, as their image is missing" in result.stderr
+    assert "note: 1 frame left out: no image" in result.stderr
 
 
 def test_says_that_nothing_had_to_be_done(make_scene_folder, tmp_path):
