@@ -113,7 +113,7 @@ def _depth_term(render: DirectRender, target: DepthTarget) -> tuple[Tensor, tupl
     assert render.weighted is not None
     drawn = render.alpha.requires_grad_(), render.weighted.requires_grad_()
     with torch.enable_grad():
-        term = target.term(expected_depth(render.weighted, render.alpha))
+        term = target.term(expected_depth(render.weighted, render.alpha), render.alpha)
     return term.detach(), torch.autograd.grad(term, drawn)
 
 

@@ -46,19 +46,23 @@ class DepthTarget(NamedTuple):
     weight: float
     """Factor of the term in the loss."""
 
-    def term(self, rendered: Tensor) -> Tensor:
-        """Compute weight times mean of ``|rendered / depth - 1|``.
+    def term(self, rendered: Tensor, alphas: Tensor) -> Tensor:
+        """Compute weight times mean of ``opacity |rendered / depth - 1|``.
 
-        It has no unit, and a few points in wrong places count little.
+        It has no unit, and a few points in wrong places count little. Where there is hardly
+        anything, the depth, which is divided by the opacity, is hardly known: such pixels count as
+        little. The factor has no gradient, as the term would fade what is misplaced.
 
         Args:
             rendered: Depth of the model. [H, W, 1]
+            alphas: Opacity. [H, W, 1]
 
         Returns:
             A scalar.
         """
-        deviations = (rendered.flatten()[self.pixels] / self.depths - 1).abs()
-        return self.weight * steady_mean(deviations)
+        ratios = rendered.flatten()[self.pixels] / self.depths
+        known = alphas.detach().flatten()[self.pixels]
+        return self.weight * steady_mean(known * (ratios - 1).abs())
 
 
 class SparseDepth:

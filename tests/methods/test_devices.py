@@ -34,7 +34,7 @@ from chronoscene.methods import (
     load_spec,
     method_names,
 )
-from chronoscene.training import devices
+from chronoscene.training import devices, sparse_depth
 
 from .small_fields import SAME_NETWORKS, SMALL_FIELD
 
@@ -54,6 +54,13 @@ QUESTIONS = 3
 fields: how many samples there are, how many are seen; and how the step went."""
 MORE_QUESTIONS = {"ha-nerf": 1, "ha-nerf-t": 1}
 """The photos that have been drawn have to be encoded."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def depth_in_every_step() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sparse_depth, "INTERVAL", 1)
+        yield
 
 
 @pytest.fixture
@@ -78,7 +85,9 @@ class Compiled:
     def method(self, device: str = "cpu") -> Method:
         """At the start of a training with as many options as all methods have."""
         config = tiny_training.small_config(self.spec)
-        options: dict[str, Any] = {"exposure": "image", "random_background": True}
+        options: dict[str, Any] = {
+            "exposure": "image", "random_background": True, "depth_weight": 0.3
+        }  # fmt: skip
         if isinstance(config, FieldConfig):
             options |= SMALL_FIELD | {"samples": 4096}
         known = {k: v for k, v in options.items() if hasattr(config, k)}

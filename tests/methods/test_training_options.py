@@ -136,7 +136,7 @@ def test_surfaces_are_held_to_the_sparse_points(name, monkeypatch):
     monkeypatch.setattr(sparse_depth, "INTERVAL", 1)  # so that a few steps are enough
     data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))
     deviations = []
-    for weight in (0.0, 1.0):
+    for weight in (0.0, 3.0):
         method = start(name, data, depth_weight=weight)
         train(method)
         rendered = [method.render(view, float(view.period)).depth for view in data.views]

@@ -17,15 +17,19 @@ from chronoscene.training.sparse_depth import INTERVAL, DepthTarget, SparseDepth
 def test_the_term_is_the_mean_relative_deviation_of_the_pixels_with_points() -> None:
     rng = np.random.default_rng(0)
     rendered, depths = rng.uniform(1, 3, (5, 7, 1)), rng.uniform(1, 3, 4)
+    alphas = rng.uniform(0, 1, (5, 7, 1))
     pixels = np.array([0, 8, 20, 34])
     target = DepthTarget(torch.from_numpy(pixels), torch.from_numpy(depths), 0.5)
-    image = torch.from_numpy(rendered).requires_grad_()
-    term = target.term(image)
-    expected = 0.5 * np.mean(np.abs(rendered.flat[pixels] / depths - 1))
+    image, opacity = (torch.from_numpy(x).requires_grad_() for x in (rendered, alphas))
+    term = target.term(image, opacity)
+    deviations = alphas.flat[pixels] * np.abs(rendered.flat[pixels] / depths - 1)
+    expected = 0.5 * np.mean(deviations)
     assert term.item() == pytest.approx(expected, rel=1e-12)
     term.backward()
     gradient = np.zeros(35)
-    gradient[pixels] = 0.5 * np.sign(rendered.flat[pixels] - depths) / depths / 4
+    signs = np.sign(rendered.flat[pixels] - depths)
+    gradient[pixels] = 0.5 * alphas.flat[pixels] * signs / depths / 4
+    assert opacity.grad is None
     np.testing.assert_allclose(image.grad.flatten(), gradient, rtol=1e-12)
 
 
