@@ -86,7 +86,7 @@ class Compiled:
         """At the start of a training with as many options as all methods have."""
         config = tiny_training.small_config(self.spec)
         options: dict[str, Any] = {
-            "exposure": "image", "random_background": True, "depth_weight": 0.3
+            "exposure": "image", "random_background": True, "depth_weight": 0.1
         }  # fmt: skip
         if isinstance(config, FieldConfig):
             options |= SMALL_FIELD | {"samples": 4096}
