@@ -25,6 +25,7 @@ from chronoscene.harness.use.cameras import Viewpoint
 from chronoscene.harness.use.changes import back_project
 from chronoscene.images.truth import load_depth
 from chronoscene.scene import Scene
+from chronoscene.scene.similarity import median_and_nmad
 from chronoscene.survey.difference import Difference, measure_volumes
 from chronoscene.survey.grid import Grid
 from chronoscene.survey.uncertainty import Registration, StableGround
@@ -59,8 +60,7 @@ def read(path: Path) -> Array:
 def robust(errors: Array) -> str:
     """Describe errors in metres."""
     errors = errors[np.isfinite(errors)]
-    median = np.median(errors)
-    nmad = 1.4826 * np.median(np.abs(errors - median))
+    median, nmad = median_and_nmad(errors)
     rmse = np.sqrt(np.mean(errors**2))
     return f"median {median:+.3f} NMAD {nmad:.3f} RMSE {rmse:.2f} m of {len(errors):,} cells"
 

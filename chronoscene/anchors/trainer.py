@@ -227,8 +227,8 @@ class AnchorTrainer:
         loss = training_loss(
             raster, due.photo, due.mask, number=due.number, exposure=self.exposure, config=config
         )
-        if target is not None and raster.depths is not None:
-            loss = loss + target.term(raster.depths[0], raster.alphas[0])
+        if target is not None:
+            loss = loss + target.term_of(raster)
         if config.scale_weight:
             loss = loss + config.scale_weight * mean_volume(splats.scales, splats.opacities)
         result = collect_gradients(

@@ -193,8 +193,8 @@ class GaussianTrainer:
         )
         mask = self.photos.mask(number)
         terms = self._regulariser(splats)
-        if target is not None and raster.depths is not None:
-            terms = terms + target.term(raster.depths[0], raster.alphas[0])
+        if target is not None:
+            terms = terms + target.term_of(raster)
         self.optimizer.zero_grad()
         result = collect_gradients(
             self.loss(raster, number, mask) + terms,

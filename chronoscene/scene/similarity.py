@@ -26,6 +26,15 @@ SIGMA = 1.4826
 """Standard deviation of normal numbers in units of the median of their absolute values."""
 
 
+def median_and_nmad(values: Array) -> tuple[float, float]:
+    """Compute the median, and the robust standard deviation: `SIGMA` times that of the deviations.
+
+    Source: Hoehle and Hoehle 2009.
+    """
+    median = float(np.median(values))
+    return median, SIGMA * float(np.median(np.abs(values - median)))
+
+
 @dataclass(frozen=True, slots=True)
 class Sim3:
     """Similarity ``x -> scale * rotation @ x + translation``, named ``target_from_source``."""

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints
 from chronoscene.harness.files.predictions import to_bytes
-from chronoscene.harness.plan.sparse_depths import MIN_IMAGES
+from chronoscene.harness.plan.sparse_depths import well_observed
 from chronoscene.methods import Prediction
 from chronoscene.scene import Camera, Scene
 from chronoscene.scene.geometry import pose_from_rotation_translation
-from chronoscene.scene.similarity import SIGMA
+from chronoscene.scene.similarity import median_and_nmad
 from chronoscene.survey.grid import Grid
 from chronoscene.survey.map_frame import MapFrame
 from chronoscene.survey.views import DepthView, look, solid_depth
@@ -78,16 +78,15 @@ def check_heights(
     """
     points = scene.points
     train = np.array([image.split == "train" for image in scene.frames])
-    counted = scene.point_periods(train)[:, period] & (np.diff(points.track_start) >= MIN_IMAGES)
+    counted = scene.point_periods(train)[:, period] & well_observed(points)
     places = frame.to_map(points.xyz[counted])
     places = places[grid.holds(places)]
     errors = surface.heights[grid.cells(places)] - places[:, 2]
     errors = errors[np.isfinite(errors)]
     if not len(errors):
         return None
-    median = float(np.median(errors))
-    spread = SIGMA * float(np.median(np.abs(errors - median)))
-    return {"count": len(errors), "median": median, "nmad": spread}
+    median, nmad = median_and_nmad(errors)
+    return {"count": len(errors), "median": median, "nmad": nmad}
 
 
 def camera_above(

@@ -15,7 +15,7 @@ from chronoscene.errors import SceneError
 from chronoscene.io.documents import read_json_document
 from chronoscene.registration.output import CERTIFICATE
 from chronoscene.scene import Scene
-from chronoscene.scene.similarity import SIGMA
+from chronoscene.scene.similarity import SIGMA, median_and_nmad
 
 CONFIDENCE = 1.96  # Standard deviations of a 95 % interval
 ONE_SIGMA = 0.683  # Share of normal numbers within one standard deviation
@@ -62,8 +62,7 @@ def stable_ground(differences: Array, deviations: Array, resolution: float) -> S
     factor = excess(differences[known] - middle, deviations[known])
     with np.errstate(invalid="ignore"):
         stable = known & (np.abs(differences - middle) <= 3 * factor * deviations)
-    median = float(np.median(differences[stable]))
-    nmad = SIGMA * float(np.median(np.abs(differences[stable] - median)))
+    median, nmad = median_and_nmad(differences[stable])
     length = DEFAULT_RANGE
     if stable.sum() >= MIN_STABLE and nmad > 0:
         length = _correlation_length(np.where(stable, differences, np.nan) / nmad)

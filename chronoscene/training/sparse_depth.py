@@ -12,6 +12,7 @@ from torch import Tensor
 
 from chronoscene.errors import SceneError
 from chronoscene.methods import TrainingSet
+from chronoscene.rasterizer import Rasterization
 from chronoscene.training.devices import to_device
 from chronoscene.training.losses import steady_mean
 
@@ -63,6 +64,11 @@ class DepthTarget(NamedTuple):
         ratios = rendered.flatten()[self.pixels] / self.depths
         known = alphas.detach().flatten()[self.pixels]
         return self.weight * steady_mean(known * (ratios - 1).abs())
+
+    def term_of(self, raster: Rasterization) -> Tensor:
+        """Compute `term` of a view that was drawn alone and with depth."""
+        assert raster.depths is not None
+        return self.term(raster.depths[0], raster.alphas[0])
 
 
 class SparseDepth:

@@ -7,15 +7,20 @@ from functools import cache
 
 import numpy as np
 
-from chronoscene.arrays import Ints
+from chronoscene.arrays import Ints, Mask
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import SparseDepths
-from chronoscene.scene import Frame, Scene
+from chronoscene.scene import Frame, Points, Scene
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.tracks import by_image, track_owners
 
 MIN_IMAGES = 3
 """Images that must see a point: two rays that are nearly parallel meet anywhere along them."""
+
+
+def well_observed(points: Points) -> Mask:
+    """Return True for finite points that at least `MIN_IMAGES` images see. [P]"""
+    return points.finite & (np.diff(points.track_start) >= MIN_IMAGES)
 
 
 def depth_loader(
@@ -33,13 +38,12 @@ def depth_loader(
         scale: Units of the training frame per unit of the world.
     """
     points = scene.points
-    usable = points.finite & (np.diff(points.track_start) >= MIN_IMAGES)
-    numbers = {frame.name: number for number, frame in enumerate(scene.frames)}
 
     @cache
     def observed() -> list[Ints]:
         """List the usable points of each of the frames."""
-        owners = track_owners(points.track_start)
+        usable, owners = well_observed(points), track_owners(points.track_start)
+        numbers = {frame.name: number for number, frame in enumerate(scene.frames)}
         rows = by_image(points.track_frame, len(scene.frames))
         seen = (owners[rows[numbers[frame.name]]] for frame in frames)
         return [point[usable[point]] for point in seen]

@@ -12,7 +12,7 @@ from chronoscene.arrays import Array, Ints
 from chronoscene.registration.quality.misalignment import generators, rotation_angle
 from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, project
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
-from chronoscene.scene.similarity import SIGMA
+from chronoscene.scene.similarity import median_and_nmad
 
 MIN_POINTS = 12  # Points of the other period that an image must see
 
@@ -97,8 +97,8 @@ def _excess(size: Array, noise: Array) -> Excess:
         noise: Expected variance of each. [n]
     """
     beyond = size**2 - noise
-    middle = float(np.median(beyond))
-    spread = SIGMA * float(np.median(np.abs(beyond - middle))) / np.sqrt(len(size))
+    middle, spread = median_and_nmad(beyond)
+    spread /= np.sqrt(len(size))
     return Excess(
         value=float(np.sqrt(max(0.0, middle))),
         low=float(np.sqrt(max(0.0, middle - 2 * spread))),
