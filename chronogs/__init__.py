@@ -69,8 +69,7 @@ SPEC = MethodSpec(
         "paper-text": _TEXT,
         "full": _FULL | {"iterations": 3_000},
         "fast": _SHORT | {"iterations": 1_000, "density_interval": 40},
-        "balanced": _SHORT | {"iterations": 3_000},
-        "survey": _SHORT | {"iterations": 3_000, "depth_weight": 0.1},
+        "balanced": _SHORT | {"iterations": 3_000, "depth_weight": 0.1, "period_decay": 0.3},
         "accurate": _SHORT
         | {"iterations": 8_000, "opacity_dropout": 0.2, "period_decay": 0.3, **MANY_ANCHORS},
     },

@@ -38,8 +38,8 @@ from chronoscene.survey.views import depth_views
 
 SUMMARY, VOLUMES = "survey.json", "volumes.csv"
 FREE = (
-    "the model was not held to the sparse points; with --preset survey of chronogs, or --set "
-    "depth_weight=0.1, lawns and other places without texture lie at their height"
+    "the model was not held to the sparse points; with --set depth_weight=0.1, as in preset "
+    "balanced of chronogs, lawns and other places without texture lie at their height"
 )
 
 

@@ -33,7 +33,6 @@ from chronoscene.training.drawing import Splats, camera_centre_tensor, predictio
 from chronoscene.training.exposure import Exposure, exposed, of_period
 from chronoscene.training.filtering import adapt_to_plain
 from chronoscene.training.periods import with_new_periods
-from chronoscene.training.sparse_depth import check_depths
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, evaluate
 from chronoscene.training.views import count_views
 
@@ -123,8 +122,6 @@ class SplattingMethod(ABC):
             "num_periods": train.num_periods,
             "background": background.tolist(),
         }
-        if self.config.depth_weight:
-            check_depths(train)
         self.trainer = self.start(train, seed=seed, device=device)
 
     def extent(self, train: TrainingSet) -> float:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from chronoscene.errors import SceneError
 from chronoscene.methods import TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.devices import to_device
@@ -18,23 +17,6 @@ from chronoscene.training.losses import steady_mean
 
 INTERVAL = 4
 """Every so many views one has the term, as drawing depth takes as long as drawing colours."""
-
-
-def check_depths(train: TrainingSet) -> None:
-    """Check that there is something to compare with.
-
-    Raises:
-        SceneError: If no view has a sparse depth.
-    """
-    if any(len(train.load_depths(number).pixels) for number in range(len(train.views))):
-        return
-    raise SceneError(
-        "sparse points",
-        expected="points that at least 3 images observe, for depth_weight",
-        found="none in the training images",
-        todo="triangulate some (chronoscene triangulate), or set depth_weight=0, as preset "
-        "balanced does",
-    )
 
 
 class DepthTarget(NamedTuple):

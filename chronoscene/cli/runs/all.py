@@ -19,7 +19,7 @@ from chronoscene.workflow.steps import Project
 @click.argument("captures", type=PATH)
 @click.argument("out", type=PATH)
 @TABLE
-@preset_option("survey")
+@preset_option("balanced")
 @BUDGET
 @WIDTH
 @MEMORY

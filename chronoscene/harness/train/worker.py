@@ -141,7 +141,12 @@ def run_job(job: Job, report: Report | None = None) -> None:
         display.wait("scores")
         record = _record(run, scene, machine, outcomes, peaks, started)
         record.warmup_seconds = warmup_seconds
-        record.notices = [*job.notices, *([notice] if notice else []), *_skips(job, record)]
+        record.notices = [
+            *job.notices,
+            *([notice] if notice else []),
+            *_unheld(run, parts),
+            *_skips(job, record),
+        ]
         for writer in (*writers.values(), final):
             writer.close_run(record)
         score_job(job, record)
@@ -360,6 +365,17 @@ def _record(
         started=started,
         notices=[],
     )
+
+
+def _unheld(run: ResolvedRun, parts: Sequence[Part]) -> list[str]:
+    """Return a notice if surfaces are to be held to sparse points, of which there are none."""
+    sets = [part.train for part in parts] if getattr(run.config, "depth_weight", 0.0) else []
+    if not sets or any(len(s.load_depths(i).pixels) for s in sets for i in range(len(s.views))):
+        return []
+    return [
+        f"{run.job.label}: depth_weight had no effect, as no training image observes a point that "
+        "3 images do (chronoscene triangulate makes points)"
+    ]
 
 
 def _skips(job: Job, record: records.RunRecord) -> list[str]:

@@ -11,7 +11,7 @@ from PIL import Image
 from chronoscene.errors import BackendError
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.harness.files.records import read_run
-from chronoscene.harness.plan import plan
+from chronoscene.harness.plan import plan, sparse_depths
 from chronoscene.harness.report.summary import read_runs
 from chronoscene.harness.report.tables import format_runs
 from chronoscene.harness.train.worker import pick_device
@@ -164,3 +164,11 @@ def test_a_gpu_without_gsplat_serves_fields(monkeypatch, set_gsplat):
     assert pick_device("cuda", load_spec("neusc")) == "cuda"
     with pytest.raises(BackendError, match=r"expected version 1\.5 or 1\.6, found none"):
         pick_device("cuda", load_spec("chronogs"))
+
+
+@pytest.mark.parametrize("observed", [True, False])
+def test_a_run_says_where_no_points_hold_its_surfaces(bench_here, monkeypatch, observed):
+    monkeypatch.setattr(sparse_depths, "MIN_IMAGES", 1 if observed else 1_000)
+    outcome, _ = bench_here("3dgs", preset="fast", iterations=5, overrides={"depth_weight": "0.1"})
+    told = "depth_weight had no effect" in " ".join(read_run(outcome.finished[0]).notices)
+    assert told != observed
