@@ -30,10 +30,15 @@ _SHORT: dict[str, Any] = _FULL | {
     "color_lr": (0.008, 0.0005),
     "antialiased": True,
     "cooldown": 0.2,
+    "period_decay": 0.3,
 }
 """Fewer numbers for each period, and other rates: what-a-scene-requires.md and tuning.md in
-docs/experiments have the trials; generalisation.md those of the dropout of ``accurate``, which has
-a decay as well: long trainings learn photos by heart; survey-accuracy.md those of ``survey``."""
+docs/experiments have the trials."""
+
+_HELD: dict[str, Any] = _SHORT | {"depth_weight": 0.1}
+"""Short trainings with surfaces that are held to the sparse points: tuning.md has the trials. Those
+of the dropout of ``accurate``, as long trainings learn photos by heart, are in
+generalisation.md."""
 
 _TEXT: dict[str, Any] = {
     "fusion": "sum",
@@ -68,10 +73,9 @@ SPEC = MethodSpec(
         "paper": {},  # as released
         "paper-text": _TEXT,
         "full": _FULL | {"iterations": 3_000},
-        "fast": _SHORT | {"iterations": 1_000, "density_interval": 40},
-        "balanced": _SHORT | {"iterations": 3_000, "depth_weight": 0.1, "period_decay": 0.3},
-        "accurate": _SHORT
-        | {"iterations": 8_000, "opacity_dropout": 0.2, "period_decay": 0.3, **MANY_ANCHORS},
+        "fast": _HELD | {"iterations": 1_000, "density_interval": 40},
+        "balanced": _HELD | {"iterations": 3_000},
+        "accurate": _SHORT | {"iterations": 8_000, "opacity_dropout": 0.2, **MANY_ANCHORS},
     },
     titles={"full": "ChronoGS, sizes of the paper"},
     resumable=True,
