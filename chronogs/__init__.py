@@ -33,12 +33,11 @@ _SHORT: dict[str, Any] = _FULL | {
     "period_decay": 0.3,
 }
 """Fewer numbers for each period, and other rates: what-a-scene-requires.md and tuning.md in
-docs/experiments have the trials."""
+docs/experiments have the trials; generalisation.md those of the dropout of ``accurate``: long
+trainings learn photos by heart."""
 
 _HELD: dict[str, Any] = _SHORT | {"depth_weight": 0.1}
-"""Short trainings with surfaces that are held to the sparse points: tuning.md has the trials. Those
-of the dropout of ``accurate``, as long trainings learn photos by heart, are in
-generalisation.md."""
+"""The same with surfaces that are held to the sparse points; not tried in ``accurate``."""
 
 _TEXT: dict[str, Any] = {
     "fusion": "sum",

@@ -36,6 +36,7 @@ from chronoscene.harness.plan.job import Job
 from chronoscene.harness.plan.memory import open_store
 from chronoscene.harness.plan.parts import Part, make_parts
 from chronoscene.harness.plan.resolve import ResolvedRun, resolve
+from chronoscene.harness.plan.sparse_depths import MIN_IMAGES
 from chronoscene.harness.plan.stop import StopRule
 from chronoscene.harness.score.regions import left_half
 from chronoscene.harness.score.scoring import NO_TESTS, score_job
@@ -374,7 +375,7 @@ def _unheld(run: ResolvedRun, parts: Sequence[Part]) -> list[str]:
         return []
     return [
         f"{run.job.label}: depth_weight had no effect, as no training image observes a point that "
-        "3 images do (chronoscene triangulate makes points)"
+        f"{MIN_IMAGES} images do (chronoscene triangulate makes points)"
     ]
 
 
