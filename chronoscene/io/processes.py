@@ -35,22 +35,40 @@ Report = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and its total."""
 
 
+AGAIN = 0.05  # Seconds after which a request to end that was lost is made once more
+
+
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Turn SIGTERM, which batch systems send, into an exit that cleans up unfinished work."""
+    """Turn SIGTERM, which batch systems send, into an exit that cleans up unfinished work.
+
+    If it comes while a finalizer runs, or a callback from C, the exit is lost; it is made again.
+    """
+
+    status = 128 + signal.SIGTERM
 
     def exit_with(number: int, frame: object) -> None:
-        raise SystemExit(128 + number)
+        raise SystemExit(status)
+
+    def report_lost(lost: sys.UnraisableHookArgs) -> None:
+        error = lost.exc_value
+        if isinstance(error, SystemExit) and error.code == status:
+            # Not here: it would be lost as well.
+            threading.Timer(AGAIN, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        else:
+            hook(lost)
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    hook, sys.unraisablehook = sys.unraisablehook, report_lost
     before = signal.signal(signal.SIGTERM, exit_with)
     try:
         yield
     finally:
         # None stands for a handler that was not set in Python, which cannot be put back.
         signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+        sys.unraisablehook = hook
 
 
 GRACE = 5.0  # Seconds that a program has to end after SIGTERM: a container is stopped in them
@@ -303,9 +321,10 @@ def _pooled(
     from multiprocessing import get_context
 
     with _safe_path():
-        pool = ProcessPoolExecutor(workers, get_context("spawn"))
-        results = pool.map(partial(_stoppably, function), items)  # starts the processes
+        pool = ProcessPoolExecutor(workers, get_context("spawn"))  # starts one that keeps watch
     try:
+        with _safe_path():
+            results = pool.map(partial(_stoppably, function), items)  # starts the others
         yield from results
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

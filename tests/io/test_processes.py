@@ -84,6 +84,21 @@ def test_a_request_to_end_cleans_up(tmp_path):
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+class Ends:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0)  # here the exit is raised
+
+
+def test_a_request_to_end_that_comes_in_a_finalizer_is_obeyed(capsys):
+    before = sys.unraisablehook
+    with pytest.raises(SystemExit) as end, stoppable():
+        Ends()
+        time.sleep(60)
+    assert end.value.code == 128 + signal.SIGTERM and sys.unraisablehook == before
+    assert capsys.readouterr().err == ""
+
+
 JOBS = """
 import os, sys, time
 
