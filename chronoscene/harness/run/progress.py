@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -24,8 +23,8 @@ class RunsDisplay:
     def __init__(self, total: int, log: Log, console: Console | None = None) -> None:
         self._total, self._ended = total, 0
         self._log = log
-        self._shares: dict[object, float] = {}
-        self._resumed: dict[object, float] = {}
+        self._shares: dict[Report, float] = {}
+        self._elsewhere: dict[Report, float] = {}  # of them, what took none of our time
         self._began = time.monotonic()
         self._lock = threading.Lock()
         console = console or Console(stderr=True)
@@ -57,23 +56,27 @@ class RunsDisplay:
     @contextmanager
     def showing(self) -> Iterator[Report]:
         """A function that takes the progress of a run; it has ended when the block does."""
-        run = object()
+
+        def report(what: str, done: int, total: int) -> None:
+            if not total:
+                self.log(what)
+                return
+            self._shares[report] = done / total
+            self._elsewhere.setdefault(report, done / total)  # the first one: trained before
+            self._show()
+
         with self._lock:
-            self._shares[run] = 0.0
+            self._shares[report] = 0.0
         self._show()
-        yield partial(self._update, run)
+        yield report
         with self._lock:  # an error ends the display, too
-            del self._shares[run]
+            del self._shares[report]
             self._ended += 1
         self._show(plain=True)
 
-    def _update(self, run: object, what: str, done: int, total: int) -> None:
-        if not total:
-            self.log(what)
-            return
-        self._shares[run] = done / total
-        self._resumed.setdefault(run, done / total)  # the first one: it took none of our time
-        self._show()
+    def leave_out(self, report: Report) -> None:
+        """Count a run that gives no result, or that another command has finished, in no rate."""
+        self._elsewhere[report] = 1.0
 
     def _show(self, *, plain: bool = False) -> None:
         with self._lock:
@@ -86,7 +89,7 @@ class RunsDisplay:
     def status(self, done: float) -> str:
         """Describe the progress in one line; ``done`` counts shares of unfinished runs, too."""
         pieces = [f"{self._ended} of {self._total} runs", f"{len(self._shares)} under way"]
-        seconds, ours = time.monotonic() - self._began, done - sum(self._resumed.values())
+        seconds, ours = time.monotonic() - self._began, done - sum(self._elsewhere.values())
         if ours > KNOWN:
             pieces.append(f"{3600 * ours / max(seconds, 1e-9):,.1f} runs/h")
             pieces.append(f"{format_time(seconds * (self._total - done) / ours)} left")

@@ -89,11 +89,11 @@ def run_plan(
     failures = []
     numbers = count(1)
 
-    def carry_out(run: ResolvedRun, execute: Execute, log: Log) -> None:
+    def carry_out(run: ResolvedRun, execute: Execute, log: Log) -> bool:
         job, number = run.job, f"[{next(numbers)}/{len(todo)}]"
         if is_finished(run, settings.overwrite):
             log(f"{number} {job.label}: another command has finished it")
-            return
+            return False
         if is_obsolete(run, settings.overwrite):
             shutil.rmtree(job.training)
         log(f"{number} {job.label}")
@@ -102,6 +102,7 @@ def run_plan(
             log(f"failed: {job.label}: {failure.reason}")
             if (trace := job.folder / records.ERROR_LOG).is_file():
                 log(f"{job.label}: {trace}")
+        return failure is None
 
     try:
         with stoppable():
@@ -111,8 +112,11 @@ def run_plan(
                         carry_out(run, execute or run_in_process, log)
             else:
                 _run_in_pool(todo, log, pool, carry_out)
-    finally:
-        records.write_summary(settings.run.runs)
+    except BaseException:
+        if records.run_folders(settings.run.runs):
+            records.write_summary(settings.run.runs)
+        raise
+    records.write_summary(settings.run.runs)
     finished = tuple(folder for folder in plan.runs if (folder / records.RUN_FILE).is_file())
     return BenchOutcome(finished, len(plan.runs) - len(todo), tuple(failures))
 
@@ -121,15 +125,19 @@ def _run_in_pool(
     todo: list[ResolvedRun],
     log: Log,
     pool: Pool,
-    carry_out: Callable[[ResolvedRun, Execute, Log], None],
+    carry_out: Callable[[ResolvedRun, Execute, Log], bool],
 ) -> None:
-    """Carry out several runs at a time, each in a thread of its own, which waits for it."""
+    """Carry out several runs at a time, each in a thread of its own, which waits for it.
+
+    ``carry_out`` returns True if it has made a result.
+    """
     under_way: set[Future[None]] = set()
     with RunsDisplay(len(todo), log) as display, ThreadPoolExecutor(pool.at_once) as threads:
 
         def locked(run: ResolvedRun, lock: Lock) -> None:
             with lock, display.showing() as report:
-                carry_out(run, partial(pool.run, report=report), display.log)
+                if not carry_out(run, partial(pool.run, report=report), display.log):
+                    display.leave_out(report)
 
         try:
             for run, lock in _in_turn(todo, display.log):

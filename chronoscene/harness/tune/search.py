@@ -273,7 +273,9 @@ def _run(
 
     def in_pool(job: Job) -> records.Failure | None:
         with display.showing() as report:
-            return pool.run(job, report)
+            if (failure := pool.run(job, report)) is not None:
+                display.leave_out(report)
+        return failure
 
     return run_plan(plan, settings, _silent, execute=execute or in_pool)
 

@@ -99,6 +99,23 @@ def test_several_runs_have_one_bar(live):
         ]
 
 
+def test_runs_without_a_result_are_not_in_the_rate_of_several_runs(monkeypatch):
+    now, said = [0.0], []
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    with RunsDisplay(4, said.append, Console(file=io.StringIO())) as display:
+        for seconds in (0.0, 0.1):
+            now[0] += seconds
+            with display.showing() as report:
+                display.leave_out(report)
+        with display.showing():
+            now[0] = 60.0
+    assert said == [
+        "1 of 4 runs, 0 under way",
+        "2 of 4 runs, 0 under way",
+        "3 of 4 runs, 0 under way, 60.0 runs/h, 1:00 left",
+    ]
+
+
 def test_what_was_trained_before_is_not_in_the_rate_of_several_runs(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])

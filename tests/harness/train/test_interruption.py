@@ -1,6 +1,5 @@
 """A bench that is killed or interrupted loses nothing finished and leaves nothing half done."""
 
-import json
 import os
 import signal
 import subprocess
@@ -110,7 +109,7 @@ def test_an_interrupted_bench_leaves_no_process_and_no_half_run(
     assert "stack trace" not in errors
     assert not Path(f"/proc/{worker}").exists()
     assert not list(runs.rglob("*.partial"))
-    assert json.loads((runs / "results.json").read_text()) == []
+    assert not (runs / "results.json").exists()
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
