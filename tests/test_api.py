@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from datetime import date, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +150,9 @@ def test_validate_wants_one_scene(in_folder):
         ({"seeds": (0, -1)}, r"--seed: expected seeds from 0 to 2\^64 - 1, found -1;"),
         ({"seeds": (2**64,)}, "--seed: expected seeds from 0 to .*, found 18446744073709551616;"),
         ({"seeds": (1.5,)}, r"--seed: expected seeds from 0 to 2\^64 - 1, found 1.5;"),
+        ({"seeds": (True,)}, r"--seed: expected seeds from 0 to 2\^64 - 1, found True;"),
+        ({"budget": timedelta(0, 3)}, "--budget: expected a positive number of seconds, found 0:0"),
+        ({"overrides": {"size": date(2020, 1, 1)}}, "value of an option: expected .*, found dat"),
         ({"seeds": 3}, r"seeds: expected seeds such as \[0\] or range\(3\), found 3;"),
         ({"seeds": "0"}, r"seeds: expected seeds such as \[0\] or range\(3\), found '0';"),
         ({"seeds": ()}, "seeds: expected at least one, found none;"),

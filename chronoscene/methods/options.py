@@ -136,7 +136,7 @@ def _adapters(config_class: type[Options]) -> dict[str, TypeAdapter[Any]]:
 
 def _parsed(place: str, value: object, adapter: TypeAdapter[Any]) -> Any:
     """Read a value as given: text that the option takes as it is, or else JSON or a tuple."""
-    readings = [json.dumps(value)]
+    readings = [json.dumps(value, default=_plain)]
     if isinstance(value, str):
         text = value.lower() if value.lower() in ("true", "false") else value
         readings.append(re.sub(r"^\((.*?),?\s*\)$", r"[\1]", text))
@@ -221,4 +221,16 @@ def _field_docstrings(config_class: type) -> dict[str, str]:
 
 def as_typed(value: Any) -> str:
     """Return a value of an option as ``--set`` takes it."""
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) else json.dumps(value, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON has in place of a number or array of NumPy; it has nothing else."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise ConfigError(
+        "value of an option",
+        expected="text, a number, true or false, or several of these",
+        found=repr(value),
+        todo="correct the value; dates are text, in quotes",
+    )

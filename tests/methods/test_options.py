@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 from installed import install
 
@@ -76,6 +77,17 @@ def test_an_option_without_effect_is_refused_where_it_is_given(tmp_path):
 @pytest.mark.parametrize("value", ["[3, 4]", "(3, 4)", "(3,4,)", "[3,4]"])
 def test_tuples_are_written_as_in_python_or_json(value):
     assert build_config(SPEC, preset="fast", overrides={"sizes": value}).sizes == (3, 4)
+
+
+def test_values_may_be_of_numpy_but_not_dates_of_a_preset_file(tmp_path):
+    given = {"iterations": np.int64(7), "rate": np.float32(0.25), "sizes": np.array([3, 4])}
+    config = build_config(SPEC, preset="fast", overrides=given)
+    assert (config.iterations, config.rate, config.sizes) == (7, 0.25, (3, 4))
+    (tmp_path / "dated.toml").write_text(
+        'method = "toy"\nbase = "fast"\n[options]\nrate = 2020-01-01\n'
+    )
+    with pytest.raises(ConfigError, match=r"an option: expected text.* found datetime.date\(2020"):
+        build_config(SPEC, preset=str(tmp_path / "dated.toml"))
 
 
 @pytest.mark.parametrize("value", ["fast", "1.5", "true", "[1]"])

@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from itertools import chain
-from numbers import Integral
+from numbers import Real
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
@@ -142,13 +144,13 @@ class BenchSettings:
             "--jobs": self.jobs,
         }
         for option, number in counts.items():
-            if number is not None and not (isinstance(number, Integral) and number >= 1):
+            if number is not None and not (type(number) is int and number >= 1):
                 raise _refused(option, "a whole number of 1 or more", number)
         for seed in self.seeds:
-            if not (isinstance(seed, Integral) and 0 <= seed < 2**64):
+            if not (type(seed) is int and 0 <= seed < 2**64):
                 raise _refused("--seed", "seeds from 0 to 2^64 - 1", seed)
         budget = self.run.budget_seconds
-        if budget is not None and not 0 < budget < math.inf:
+        if budget is not None and not (isinstance(budget, Real) and 0 < budget < math.inf):
             raise _refused("--budget", "a positive number of seconds", budget)
 
 
@@ -175,7 +177,7 @@ def bench_settings(
         runs: As ``preset`` and ``lpips_weights`` for `RunSettings`, in any form.
         dataset_format: Format of the scenes; None to detect it.
         period_by: Rule by which images are grouped into periods, as for `read_scene`.
-        options: Other fields of both classes, by their names.
+        options: Other fields of both classes, by their names; numbers may be of NumPy.
 
     Raises:
         SceneError: If a folder has no scene.
@@ -185,6 +187,7 @@ def bench_settings(
     """
     if lpips_weights is not None:
         check_available(lpips_weights)
+    options = {name: _plain(value) for name, value in options.items()}
     rule = absolute_rule(period_by)
     found = [find_scenes(folder, format=dataset_format, period_by=rule) for folder in scenes]
     listed = tuple(chain.from_iterable(found))
@@ -198,3 +201,10 @@ def bench_settings(
     )
     shared = {name: options[name] for name in ours}
     return BenchSettings(listed, methods, run, **shared)
+
+
+def _plain(value: Any) -> Any:
+    """Return numbers of NumPy as those of Python: jobs and configs are stored as JSON."""
+    if isinstance(value, tuple):
+        return tuple(map(_plain, value))
+    return value.item() if isinstance(value, np.generic) else value

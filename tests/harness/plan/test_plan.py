@@ -1,8 +1,10 @@
 """Plans: whose overrides they are, and what a run differs in."""
 
+import json
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from chronoscene import methods
@@ -29,6 +31,16 @@ def test_overrides_with_a_prefix_are_for_one_method(tmp_path):
     settings = RunSettings(tmp_path, overrides={"blind.rate": "1", "rate": "2"})
     assert overrides_of(settings.overrides, "mean") == {"rate": "2"}
     assert overrides_of(settings.overrides, "blind") == {"rate": "1"}
+
+
+def test_numbers_of_numpy_are_taken_as_those_of_python(scene_folder, tmp_path):
+    numbers = {"seeds": tuple(np.arange(2)), "iterations": np.int64(3), "max_width": np.int32(24)}
+    numbers["budget_seconds"] = np.float32(1.5)
+    settings = bench_settings((scene_folder,), ("toy_methods:MEAN",), tmp_path / "runs", **numbers)
+    runs = plan_runs(settings, lambda line: None).runs
+    assert [folder.name for folder in runs] == ["seed0", "seed1"]
+    documents = [json.loads(json.dumps(run.job.document())) for run in runs.values()]
+    assert [document["seed"] for document in documents] == [0, 1]
 
 
 def test_planning_builds_each_configuration_once(scene_folder, tmp_path, monkeypatch):
