@@ -104,8 +104,6 @@ def format_runs(
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
     made = protocol_tables(beside) + readable_tables(entries, records, metrics, periods=periods)
     made = with_columns(made, columns) if columns else made
-    if any(table.ranks for table in made):
-        notes.insert(0, tables.LEGENDS[style])
     return tables_text(made, notes, style, width=width)
 
 
@@ -159,7 +157,7 @@ def with_columns(made: Iterable[Table], names: Sequence[str]) -> list[Table]:
 def tables_text(
     made: Sequence[Table], notes: Iterable[str], style: str, *, width: int | None = None
 ) -> str:
-    """Format tables and the notes below them.
+    """Format tables, and below them the legend of their ranks, if there are any, and the notes.
 
     Args:
         made: The tables.
@@ -167,9 +165,12 @@ def tables_text(
         style: ``table``, ``markdown`` or ``latex``.
         width: Characters of the terminal that ``table`` goes to; None for no limit.
     """
+    legend = [tables.LEGENDS[style]] if any(table.ranks for table in made) else []
     if style == "markdown":
         texts = [tables.markdown(table, special=r"\`*<>|_") for table in made]
-        return "\n".join([*texts, tables.markdown_list(notes)])
+        marks = "".join(f"- {line}\n" for line in legend)  # as they look in the table
+        return "\n".join([*texts, marks + tables.markdown_list(notes)])
+    notes = [*legend, *notes]
     if style == "latex":
         texts, bullet = [tables.latex(table, cmidrules=True) for table in made], "% "
     else:

@@ -245,6 +245,11 @@ def test_notes_in_markdown_have_no_markup_of_their_own():
     assert "\n<img src=x> of a_b\n" in format_runs([run], [], "table", ["psnr"])
 
 
+def test_the_legend_in_markdown_looks_like_the_marks():
+    text = format_runs(RUNS, [], "markdown", ["psnr"])
+    assert "\n- **bold**, <ins>underlined</ins>, *italic*: the first three of a column\n- " in text
+
+
 def test_published_rows_stand_below_the_measured_ones_and_are_never_marked():
     runs = [run.model_copy(update={"scene": "Lawncourt"}) for run in RUNS]
     runs.append(record("3dgs", psnr=(9.0, 9.0), scene="plaza", strategy="pooled"))
