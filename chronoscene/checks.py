@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
@@ -95,6 +96,12 @@ def load_entry(entries: Iterable[EntryPoint], name: str, kind: str) -> Any:
             found=f"{type(error).__name__}: {error}",
             todo=f"install what {package} needs, or another version of it, or uninstall it",
         ) from error
+
+
+def line_of(error: Exception) -> str:
+    """Return the line that raised an error, in parentheses; nothing if there is no file."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return "" if frame.filename.startswith("<") else f" ({frame.filename}:{frame.lineno})"
 
 
 def _package(entry: EntryPoint) -> str:

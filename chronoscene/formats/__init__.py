@@ -18,6 +18,8 @@ writes appears complete or not at all.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -25,9 +27,9 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from chronoscene.checks import check_choice, load_entry
+from chronoscene.checks import check_choice, line_of, load_entry
 from chronoscene.colmap.raw_model import FoundModel, find_model, find_stray_model
-from chronoscene.errors import ConfigError, SceneError
+from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 from chronoscene.io.wording import joined
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import SPLIT
@@ -153,7 +155,8 @@ class DetectedFormat:
         """Read the scene; see `read_scene`."""
         self.check_single()
         model = {"model": self.model} if self.is_by_names else {}
-        scene: Scene = self.module.read(self.path, **model, **self.options)
+        with _of_package(self.name, self.path):
+            scene: Scene = self.module.read(self.path, **model, **self.options)
         return scene
 
 
@@ -220,7 +223,26 @@ def _match(path: Path, period_by: str | None) -> tuple[DetectedFormat | None, Fo
 
 def _has_marks(name: str, path: Path, model: FoundModel | None) -> bool:
     module = load_format(name)
-    return bool(module.matches(path, model) if hasattr(module, "assign") else module.matches(path))
+    with _of_package(name, path):
+        return bool(module.matches(path, *([model] if hasattr(module, "assign") else [])))
+
+
+@contextmanager
+def _of_package(name: str, path: Path) -> Iterator[None]:
+    """Name the format of another package whose code fails on a folder."""
+    try:
+        yield
+    except (ChronoSceneError, OSError):
+        raise
+    except Exception as error:
+        if name in FORMATS:
+            raise
+        raise SceneError(
+            path,
+            expected=f"a folder that the code of the format {name} can deal with",
+            found=f"{type(error).__name__}: {error}{line_of(error)}",
+            todo="correct the package of the format, or report this to its author",
+        ) from error
 
 
 def _has_images(path: Path, model: FoundModel | None) -> bool:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import importlib
 import sys
-import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
-from chronoscene.checks import check_choice, load_entry, nearest
+from chronoscene.checks import check_choice, line_of, load_entry, nearest
 from chronoscene.errors import ConfigError
 
 PeriodInput = Literal["none", "label", "continuous"]
@@ -156,7 +155,7 @@ def import_object(reference: str) -> Any:
         raise ConfigError(
             reference,
             expected="a module that can be imported",
-            found=f"{type(error).__name__}: {error}{_line_of(error)}",
+            found=f"{type(error).__name__}: {error}{line_of(error)}",
             todo=f"correct {place}, or install what it needs",
         ) from error
     try:
@@ -168,12 +167,6 @@ def import_object(reference: str) -> Any:
             found=f"none called {name!r}",
             todo=nearest(name, dir(module), otherwise="define it there, or check the spelling"),
         ) from error
-
-
-def _line_of(error: Exception) -> str:
-    """Return the line that raised an error, in parentheses; nothing if there is no file."""
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    return "" if frame.filename.startswith("<") else f" ({frame.filename}:{frame.lineno})"
 
 
 def method_names(group: str = ENTRY_POINT_GROUP) -> tuple[str, ...]:

@@ -4,8 +4,10 @@ import pytest
 from installed import install
 
 from chronoscene import formats
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import detect, format_names, read_scene, writable_formats
+from chronoscene.harness.plan.plan import plan_runs
+from chronoscene.harness.plan.settings import bench_settings
 
 PLUG_IN = """
 from pathlib import Path
@@ -67,3 +69,25 @@ def test_a_broken_format_is_named(install_format, make_scene_folder, source, mes
     install_format(source)
     with pytest.raises(ConfigError, match=f"^dataset format toy: expected .*{message}"):
         read_scene(make_scene_folder())
+
+
+@pytest.mark.parametrize("function", ["matches", "read"])
+def test_a_format_whose_code_fails_is_named(install_format, tmp_path, function):
+    install_format(PLUG_IN.replace(f"def {function}(path):", f"def {function}(path):\n    1 / 0\n"))
+    (tmp_path / "toy.txt").write_text("")
+    message = r"the format toy can .* found ZeroDivisionError: division by zero \(.*\.py:\d+\); "
+    with pytest.raises(SceneError, match=message):
+        read_scene(tmp_path)
+
+
+def test_runs_are_of_the_folder_of_a_format_that_points_elsewhere(
+    install_format, tmp_path, make_scene_folder
+):
+    install_format(PLUG_IN)
+    folder = tmp_path / "toys"
+    folder.mkdir()
+    images = {f"{name}/{i}.png": period for period, name in enumerate("ab") for i in range(3)}
+    (folder / "toy.txt").write_text(str(make_scene_folder(images)))
+    settings = bench_settings((folder,), ("3dgs",), tmp_path / "runs")
+    (run,) = plan_runs(settings, lambda line: None).runs.values()
+    assert run.job.read_scene().num_periods == 2

@@ -103,9 +103,9 @@ def _runs_of_scene(
             origin=RunOrigin(
                 method=method.reference,
                 plugin_path=str(Path.cwd()) if ":" in method.reference else None,
-                scene_root=str(scene.content.root.resolve()),
-                scene_format=scene.content.format,
-                period_by=scene.period_by,
+                scene_root=str(scene.source.path.resolve()),
+                scene_format=scene.source.name,
+                period_by=scene.source.period_by,
                 validation=own.validation,
                 shrink=own.shrink,
             ),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chronoscene.errors import ConfigError
+from chronoscene.formats import DetectedFormat
 from chronoscene.harness.files.predictions import safe_part
 from chronoscene.harness.files.provenance import scene_hash, scene_stamp
 from chronoscene.harness.files.source import read_bench_scene
@@ -23,8 +24,8 @@ class BenchScene:
     """A scene with all that its runs need to know of it."""
 
     content: Scene
-    period_by: str | None
-    """Rule by which its images were grouped into periods."""
+    source: DetectedFormat
+    """Folder and format by which it is read; a format may take the scene from another folder."""
     hash: str
     stamp: str
     """Stamp of its files, taken before the hash."""
@@ -39,7 +40,7 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
         SceneError: If one cannot be read or trained on.
         ConfigError: If two have the same name, or as `check_not_among_runs`.
     """
-    scenes: dict[str, tuple[Scene, str | None]] = {}
+    scenes: dict[str, tuple[Scene, DetectedFormat]] = {}
     for found in settings.scenes:
         log(f"read {found.path}")
         scene = read_bench_scene(
@@ -59,12 +60,13 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
         check_not_among_runs(scene, settings.run.runs)
         check_scene(scene)
         check_points(scene)
-        scenes[scene.name] = scene, found.period_by
-    for scene, period_by in scenes.values():
+        scenes[scene.name] = scene, found
+    for scene, found in scenes.values():
         log(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
         needs = photo_needs(scene, settings.run)
         stamp = scene_stamp(scene)
-        yield BenchScene(scene, period_by, scene_hash(scene), stamp, split_hash(scene), needs)
+        hashes = scene_hash(scene), stamp, split_hash(scene)
+        yield BenchScene(scene, found, *hashes, needs)
 
 
 def check_not_among_runs(scene: Scene, runs: Path) -> None:
