@@ -38,7 +38,8 @@ MAX_COST = 1e15
 """Largest absolute value of a number that is no metric."""
 
 _NAME = re.compile(r"\w[\w .,:+@()-]{0,99}", re.ASCII)
-_VARIANT = re.compile(r"(\w+=[\w.,+:() -]+(,\w+=[\w.,+:() -]+)*)?", re.ASCII)
+_VALUE = r"(\[[\w.+ ,-]*\]|[\w.,+:() -]+)"  # A tuple is written in brackets
+_VARIANT = re.compile(rf"(\w+={_VALUE}(,\w+={_VALUE})*)?", re.ASCII)
 _WORDS = re.compile("publish|verif|claim|measure", re.IGNORECASE)  # of the board
 _HASH = re.compile(r"[0-9a-f]{64}")
 

@@ -42,6 +42,15 @@ def test_a_folder_of_runs_gives_an_entry_per_setting(make_run, enter, tmp_path):
     assert sorted(len(read_entry(path).runs) for path in written) == [1, 1, 2]
 
 
+def test_options_with_several_values_are_entered(make_run, enter, tmp_path):
+    """As `as_typed` writes them."""
+    variant = "offset_lr=[0.01, 1e-05],sh_degree=2"
+    (path,) = enter([make_run(variant=variant)], tmp_path / "entries")
+    assert read_entry(path).runs[0].record.variant == variant
+    with pytest.raises(ConfigError, match="variant is no list of options"):
+        enter([make_run(variant="offset_lr=[1, 2] [code 1]")], tmp_path / "entries")
+
+
 def test_devices_have_entries_of_their_own(make_run, enter, tmp_path):
     enter([make_run()], tmp_path / "entries")
     enter([make_run(device="cuda (Test)")], tmp_path / "entries")
