@@ -18,7 +18,8 @@ from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.settings import RunSettings
 from chronoscene.scene import Scene
 
-LONGEST_NAME = 180  # Characters; file systems allow 255 bytes, and special ones become longer
+LONGEST_NAME = 180  # Characters
+MOST_BYTES = 250  # File systems allow 255; special characters take three, others up to four
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +90,12 @@ class Job:
     def folder(self) -> Path:
         """Folder of the finished run."""
         name = "-".join(filter(None, (*self._names, self.variant)))
+        short = f"-{config_hash({'variant': self.variant})[:8]}"
         if len(name) > LONGEST_NAME:
-            name = f"{name[:LONGEST_NAME]}-{config_hash({'variant': self.variant})[:8]}"
+            name = name[:LONGEST_NAME] + short
         folder = safe_part(name)
+        if len(folder.encode()) > MOST_BYTES:
+            folder = safe_part(name[: LONGEST_NAME // 3] + short)
         return self.settings.runs / safe_part(self.scene) / folder / f"seed{self.seed}"
 
     @property

@@ -37,6 +37,12 @@ def changed(change: dict[str, Any]) -> Job:
     return replace(JOB, **own).with_settings(**others)
 
 
+@pytest.mark.parametrize("character", ["a", "日", "\U0001f327", "/", '"'])
+def test_folders_of_runs_have_names_that_file_systems_allow(character):
+    names = [changed({"variant": f"s={character * n}"}).folder.parent.name for n in (9, 150, 999)]
+    assert len({*names}) == 3 and all(len(name.encode()) <= 255 for name in names)
+
+
 @pytest.mark.parametrize(
     ("text", "seconds"),
     [("90s", 90), ("5m", 300), ("1.5h", 5400), ("1h30m", 5400), ("2m3.5s", 123.5)],
