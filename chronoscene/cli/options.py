@@ -14,7 +14,7 @@ import click
 from click.core import ParameterSource
 
 from chronoscene.errors import ConfigError
-from chronoscene.formats import format_names, load_format
+from chronoscene.formats import format_names, formats_that_load
 
 PATH = click.Path(path_type=Path)
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -41,7 +41,7 @@ class FiniteRange(FiniteFloat, click.FloatRange):
 
 
 def _period_help() -> str:
-    known = {name: getattr(load_format(name), "PERIOD_BY", ()) for name in format_names()}
+    known = {name: getattr(it, "PERIOD_BY", ()) for name, it in formats_that_load().items()}
     rules = "; ".join(f"{name}: {', '.join(by)}" for name, by in known.items() if by)
     return f"Rule that groups images into periods, for formats with a choice. {rules}."
 

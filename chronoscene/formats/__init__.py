@@ -19,7 +19,7 @@ writes appears complete or not at all.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -346,6 +346,15 @@ def read_scene(
     return detect(Path(path), format=format, period_by=period_by).read()
 
 
+def formats_that_load() -> dict[str, Any]:
+    """Modules of the formats by their sorted names, without those of packages that are broken."""
+    modules = {}
+    for name in format_names():
+        with suppress(ConfigError):
+            modules[name] = load_format(name)
+    return modules
+
+
 def writable_formats() -> tuple[str, ...]:
     """Names of the formats that can be written, sorted."""
-    return tuple(name for name in format_names() if hasattr(load_format(name), "write"))
+    return tuple(name for name, module in formats_that_load().items() if hasattr(module, "write"))

@@ -67,8 +67,11 @@ def test_a_format_of_another_package(install_format, tmp_path, make_scene_folder
 )
 def test_a_broken_format_is_named(install_format, make_scene_folder, source, message):
     install_format(source)
+    folder = make_scene_folder()
     with pytest.raises(ConfigError, match=f"^dataset format toy: expected .*{message}"):
-        read_scene(make_scene_folder())
+        read_scene(folder)
+    assert read_scene(folder, format="chronoscene").num_periods == 2
+    assert "toy" not in writable_formats()
 
 
 @pytest.mark.parametrize("function", ["matches", "read"])
