@@ -46,6 +46,7 @@ photos in a row by 7. Photos of so little contrast are not compared."""
 FAR_METRES = 2_000.0  # Between the positions of a period and all others: it is of another place
 
 _PLAIN_MODES = ("RGB", "L")
+_READ_BY_COLMAP = ("JPEG", "PNG", "TIFF", "BMP")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -418,7 +419,7 @@ def renamed(captures: Sequence[Capture], names: Sequence[str]) -> tuple[Capture,
 def _is_plain(path: Path) -> bool:
     """Return True if COLMAP reads a file in colour, as it is stored."""
     with Image.open(path) as image:
-        read = image.format not in ("HEIF", "AVIF") and image.mode in _PLAIN_MODES
+        read = image.format in _READ_BY_COLMAP and image.mode in _PLAIN_MODES
         plain = read and getattr(image, "n_frames", 1) == 1
         turned_tiff = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) != 1
     return plain and not turned_tiff

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
-from chronoscene.images.decoding import HEIF_SUFFIXES, HEIF_TODO, reads_heif
+from chronoscene.images.decoding import HEIF_SUFFIXES, HEIF_TODO, reads_heif, stored_size
 from chronoscene.images.exif import RTK_FIXED, RTK_FLOAT, ExifData, read_exif, taken_at
 from chronoscene.images.masks import find_masks
 from chronoscene.io.documents import plain_file
@@ -70,7 +70,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
     """Read a capture; the reason if it is unusable. All files are decoded: many are truncated."""
     try:
         with Image.open(plain_file(path)) as image:
-            width, height = image.size
+            width, height = stored_size(image)
             # A JPEG is then read to its end, but decoded at a reduced size.
             image.draft("RGB", (width // 8, height // 8))
             image.load()

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.geodesy import Georeference
+from chronoscene.images.decoding import load_rgb
 from chronoscene.registration.photos import inputs
 from chronoscene.registration.photos.captures import Captures, read_captures
 from chronoscene.registration.photos.gps_priors import locate
@@ -62,6 +63,26 @@ def test_files_without_plain_colours_become_png(folder: Path, tmp_path: Path) ->
         with Image.open(tmp_path / "photos" / name) as image:
             assert image.mode == "RGB"
     assert [c.name for c in inputs.renamed(captures, names)] == names
+
+
+def test_photos_that_colmap_does_not_read_become_png(folder: Path, tmp_path: Path) -> None:
+    save(folder / "web.webp", 0, lossless=True)
+    save(folder / "named.jpg", 1, format="WEBP")
+    captures = read_captures(folder).images
+    names, _ = inputs.place_photos(captures, tmp_path / "photos")
+    assert names == ["named.jpg.png", "web.webp.png"]
+    for capture, name in zip(captures, names, strict=True):
+        placed = tmp_path / "photos" / name
+        assert np.array_equal(load_rgb(placed), load_rgb(capture.path))
+
+
+def test_the_size_of_a_turned_tiff_is_that_of_its_pixels(folder: Path) -> None:
+    """By it, clicks are checked, calibrations scaled, and cameras told apart."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    save(folder / "turned.tif", 0, exif=exif)
+    (capture,) = read_captures(folder).images
+    assert (capture.width, capture.height) == (96, 72)
 
 
 def test_transparent_pixels_become_black_so_that_nothing_is_found_there(
