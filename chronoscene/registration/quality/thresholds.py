@@ -32,21 +32,40 @@ class Threshold:
         return "doubtful" if sign * value > sign * self.doubtful else "pass"
 
 
-AGAIN = "run again with --tie-points"
-CLICK = (
-    "mark points that both dates show with chronoscene mark (--report may suggest spots), and "
-    f"{AGAIN}"
-)
-LOOK = (
+_MARK = "mark points that both dates show with chronoscene mark (--report may suggest spots), and"
+_LOOK = (
     "look at the comparisons on the page (--report); if flat ground that did not change jumps in "
-    f"most of them, {CLICK}"
+    "most of them,"
 )
+_RELIABLE = "if the GPS is reliable,"
+_CALIBRATE, _OBLIQUE = "calibrate each date (--calibration per-period)", "add oblique photos"
+_SAME_LENS = "if the lens and its focus were the same,"
+_OTHER_LENS = "else calibrate it (--cameras), or photograph from the sides as well"
+
+CLICK = f"{_MARK} run again with --tie-points"
+LOOK = f"{_LOOK} {CLICK}"
+OFFSET = f"{_RELIABLE} {CLICK}"
 WORST = "look at the worst pair on the page (--report); remove its photos if they do not fit"
 PLACE = "check that the photos show this place; leave out those that do not"
 REPEAT = (
     "photograph again from where the photos of the other date were taken, in the same directions"
 )
 CONTROL = "give ground control: --tie-points with world coordinates"
+BEND = f"{_CALIBRATE}, or {_OBLIQUE}; otherwise {CONTROL}"
+SHARED = f"{_SAME_LENS} run again with --calibration shared; {_OTHER_LENS}"
+
+_TOGETHER = "register all dates together, without --into,"
+_CLICKED = f"{_MARK} {_TOGETHER} with --tie-points"
+AFTER_INTO = {
+    CLICK: _CLICKED,
+    LOOK: f"{_LOOK} {_CLICKED}",
+    OFFSET: f"{_RELIABLE} {_CLICKED}",
+    CONTROL: f"{_TOGETHER} with ground control: --tie-points with world coordinates",
+    BEND: f"{_OBLIQUE}, or {_TOGETHER} with ground control: --tie-points with world coordinates",
+    SHARED: f"{_SAME_LENS} {_TOGETHER} with --calibration shared; {_OTHER_LENS}",
+}
+"""Advice after ``--into``, which takes neither tie points nor another calibration, in place of the
+keys; other advice stays as it is."""
 
 THRESHOLDS: dict[str, Threshold] = {
     "registered": Threshold(
@@ -105,8 +124,7 @@ THRESHOLDS: dict[str, Threshold] = {
         unit="degrees", doubtful=0.04, fail=0.4,
         why="errors that no similarity explains come from drift that deforms a period (doming), "
         "which turns images by twice as much, or from a wrong camera",
-        todo="calibrate each date (--calibration per-period), or add oblique photos; otherwise "
-        + CONTROL,
+        todo=BEND,
     ),
     "loose": Threshold(
         what="photos in parts of the model that most of their matches contradict",
@@ -149,8 +167,7 @@ THRESHOLDS: dict[str, Threshold] = {
         unit="%", doubtful=0.2,
         why="there, a camera that stands further back with a longer lens sees nearly the same, so "
         "an error of the focal length moves it by that share of the depth",
-        todo="if the lens and its focus were the same, run again with --calibration shared; else "
-        "calibrate it (--cameras), or photograph from the sides as well",
+        todo=SHARED,
     ),
     "clouds": Threshold(
         what="shift between the surfaces of two periods, if its interval excludes 0",
@@ -178,7 +195,7 @@ THRESHOLDS: dict[str, Threshold] = {
         unit="m", doubtful=5.0, fail=15.0,
         why="the bias of a receiver varies by up to about 3.5 m from day to day; heights vary "
         "more, so they are not judged",
-        todo=f"if the GPS is reliable, {CLICK}",
+        todo=OFFSET,
     ),
     "gps_residual": Threshold(
         what="residual of a period's cameras to its own GPS, median of neighbouring ones",

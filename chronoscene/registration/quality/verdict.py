@@ -19,7 +19,7 @@ from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import MIN_TRACKS, Interval, Misalignment
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
 from chronoscene.registration.quality.thresholds import (
-    AGAIN,
+    AFTER_INTO,
     CLICK,
     LEVELS,
     LOOK,
@@ -51,8 +51,6 @@ ROOM, MARGIN = 0.95, 0.8
 of them by little. The second is that of forward-facing captures, and of intervals that only
 surfaces narrow so far, as neighbouring patches of real surfaces can err together."""
 
-ALL_DATES = "register all dates together, without --into, with --tie-points"
-"""In place of `AGAIN` after ``--into``, which takes no tie points."""
 MIN_TIES = 3  # Tie points, clicked ones for example, that two periods need to be linked
 
 LACKING = ("held_out", "rotation", "shift", "occupied", "tied")
@@ -104,7 +102,7 @@ def judge(certificate: Certificate) -> Verdict:
         objections = [f for p in certificate.periods for f in _thin(p)] + objections
     objections.sort(key=lambda f: -LEVELS.index(f.level))
     if certificate.route == "frozen":
-        objections = [replace(f, todo=f.todo.replace(AGAIN, ALL_DATES)) for f in objections]
+        objections = [replace(f, todo=AFTER_INTO.get(f.todo, f.todo)) for f in objections]
     return Verdict(level, _words(certificate, level, objections), tuple(objections), pairs)
 
 

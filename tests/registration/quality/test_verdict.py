@@ -27,6 +27,7 @@ from chronoscene.registration.quality.localisation import Excess, Localisation
 from chronoscene.registration.quality.misalignment import Interval, Misalignment
 from chronoscene.registration.quality.overlap import TieSpread
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
+from chronoscene.registration.quality.thresholds import AFTER_INTO, THRESHOLDS
 from chronoscene.registration.quality.verdict import Verdict, _of_period, judge
 from chronoscene.registration.result import ANOTHER_PLACE
 from chronoscene.scene.similarity import Sim3
@@ -628,6 +629,13 @@ def test_what_to_do_is_said_once_and_can_be_done() -> None:
     assert todo.startswith("look at the comparisons") and todo.endswith("again with --tie-points")
     (extended,) = judge(replace(both, route="frozen")).todo
     assert extended.endswith("register all dates together, without --into, with --tie-points")
+
+
+@pytest.mark.parametrize("check", THRESHOLDS)
+def test_no_advice_after_into_is_refused_with_into(check: str) -> None:
+    advice = AFTER_INTO.get(THRESHOLDS[check].todo, THRESHOLDS[check].todo)
+    refused = "--tie-points" in advice or "--calibration" in advice
+    assert not refused or "without --into" in advice
 
 
 def test_a_row_that_is_not_proven_is_told_what_to_photograph() -> None:
