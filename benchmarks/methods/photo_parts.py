@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
+from chronoscene.errors import ChronoSceneError, ConfigError
 from chronoscene.fields.method import FieldMethod
 from chronoscene.fields.network import Codes
 from chronoscene.fields.rays import view_rays
@@ -44,16 +45,29 @@ def values(method: FieldMethod, view: View, codes: Codes) -> NDArray[np.float32]
 
 
 def explain(run: TrainedRun, names: list[str]) -> list[dict[str, NDArray[np.floating]]]:
-    """Return the pictures of each photo by their titles; the uncertainty comes last."""
+    """Return the pictures of each photo by their titles; the uncertainty comes last.
+
+    Raises:
+        ConfigError: If a photo is no training image of the run.
+    """
     scene = run.scene()
     frames = scene.select(split="train")
+    numbers = {frame.name: i for i, frame in enumerate(frames)}
+    for name in names:
+        if name not in numbers:
+            raise ConfigError(
+                "PHOTO",
+                expected=f"the name of a training image, such as {min(numbers)}",
+                found=name,
+                todo="choose one of sparse/split.txt that is no test image",
+            )
     method: Any = run.model(0)
     lights: Tensor = method.network.params["light_codes"]
     passing: Tensor = method.network.params["transient_codes"]
     periods = torch.tensor([frame.period for frame in frames])
     store, rows = run.photos(scene), []
     for name in names:
-        (number,) = (i for i, frame in enumerate(frames) if frame.name == name)
+        number = numbers[name]
         (view,) = run.frame_views(scene, [frames[number]])
 
         def lasting(light: Tensor, view: View = view) -> NDArray[np.float32]:
@@ -76,7 +90,10 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("photo", nargs="+")
     options = parser.parse_args()
-    rows = explain(open_run(options.run), options.photo)
+    try:
+        rows = explain(open_run(options.run), options.photo)
+    except ChronoSceneError as error:
+        parser.error(str(error))
     most = max(float(row["uncertainty"].max()) for row in rows)
     height, width = rows[0]["uncertainty"].shape
     size = (CELL * len(rows[0]), (CELL * height / width + 0.05) * len(rows) + 0.4)
