@@ -274,7 +274,8 @@ def test_a_page_without_points_starts_with_an_empty_one(
     assert status.inner_text() == "1 point, 0 marks"
     opened.tab.locator("#only").check()
     opened.tab.keyboard.press("ArrowRight")
-    assert status.inner_text() == "No other photo is near this point."
+    assert status.inner_text() == "No other photo has a mark of this point."
+    assert "only photos with a mark of the point" in opened.tab.locator("nav").inner_text()
     assert opened.errors == []
     opened.context.close()
 

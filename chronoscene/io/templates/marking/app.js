@@ -66,6 +66,7 @@ function predict(target) {
   }
   return line.some(Boolean) ? { line } : null;
 }
+const posed = photos.some(p => p.camera);  // Without a model, only marked photos are near.
 const isNear = p => {
   const found = predict(p), within = xy => xy && xy[0] >= 0 && xy[0] <= p.width && xy[1] >= 0
     && xy[1] <= p.height;
@@ -75,7 +76,7 @@ function step(by) {
   const from = photo;
   do photo = (photo + by + photos.length) % photos.length;
   while (photo !== from && $("only").checked && !isNear(photos[photo]));
-  if (photo === from) say("No other photo is near this point.");
+  if (photo === from) say(`No other photo ${posed ? "is near" : "has a mark of"} this point.`);
   fit();
   show();
 }
