@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +40,7 @@ def convert(
     image_source: ImageSource = "copy",
     progress: Progress | None = None,
     written: Collection[str] = (),
+    check: Callable[[Scene], object] | None = None,
 ) -> Conversion:
     """Read a scene in any format and write it in another; the source is not changed.
 
@@ -52,6 +53,7 @@ def convert(
         image_source: Copy or link the images.
         progress: Called after each image.
         written: Names of files that the caller writes into ``out`` afterwards.
+        check: Called with the scene before anything is written; what it raises ends the conversion.
 
     Raises:
         SceneError: If the source is damaged, or ``out`` is in use.
@@ -61,6 +63,8 @@ def convert(
     check_outside(out, [source])
     detected = detect(source, format=source_format, period_by=period_by)
     scene = detected.read()
+    if check is not None:
+        check(scene)
     notes = (*detected.notes, *remarks_on(scene, written))
     warnings = (*notes, *losses(scene, target), *obstacles(scene))
     load_format(target).write(scene, out, image_source=image_source, progress=progress)

@@ -97,6 +97,27 @@ class ReferenceSystem:
         x, y, z = _to_wgs84(self.text).transform(longitude, latitude, height, direction=inverse)
         return np.column_stack([x, y, z / self.unit])
 
+    def remark_on(self, frame: Georeference) -> str | None:
+        """Return a remark if the origin of a frame is outside of the area of the system.
+
+        Its coordinates are as PROJ computes them there: distorted, or far off without a sign of it.
+        None inside, and for a system without an area.
+        """
+        import pyproj
+
+        area = pyproj.CRS.from_user_input(self.text).area_of_use
+        if area is None:
+            return None
+        width = (area.east - area.west) % 360 or 360
+        east = (frame.longitude - area.west) % 360 <= width
+        if east and area.south <= frame.latitude <= area.north:
+            return None
+        return (
+            f"the scene is at {frame.latitude:.4f} north, {frame.longitude:.4f} east, outside of "
+            f"the area of {self.text} ({area.south:g} to {area.north:g} north, {area.west:g} to "
+            f"{area.east:g} east): coordinates in it are distorted or wrong"
+        )
+
     def derivative(self, frame: Georeference, enu: Array) -> Array:
         """Derivative of the coordinates by those of the local frame. [N, 3] -> [N, 3, 3]"""
         places = enu[:, None, None] + STEP * np.array([1.0, -1.0])[:, None, None] * np.eye(3)

@@ -149,3 +149,21 @@ def test_projected_coordinates_and_back() -> None:
     expected = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     np.testing.assert_allclose(axes[:2, :2], expected, atol=2e-5)
     np.testing.assert_allclose(axes[2], [0, 0, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("crs", "inside", "outside"),
+    [
+        ("EPSG:32632", (48.0, 9.0), (48.0, 13.0)),
+        ("EPSG:32760", (-17.0, 179.0), (17.0, 179.0)),
+        ("EPSG:3460", (-17.0, -179.5), (-17.0, 170.0)),  # Fiji, on both sides of 180 degrees
+        ("EPSG:3857", (48.0, -179.0), (89.0, 9.0)),
+        ("+proj=utm +zone=32", (48.0, 9.0), None),
+    ],
+)
+def test_a_place_outside_of_the_area_of_a_system(crs, inside, outside) -> None:
+    system = read_reference_system("", crs)
+    assert system.remark_on(Georeference(*inside, 0.0, "as stated")) is None
+    if outside is not None:
+        remark = system.remark_on(Georeference(*outside, 0.0, "as stated"))
+        assert remark is not None and crs in remark

@@ -17,7 +17,7 @@ from chronoscene.formats import read_scene, writable_formats
 from chronoscene.geodesy import Georeference, from_crs, read_projected
 from chronoscene.io.staging import check_outside
 from chronoscene.registration.report.coordinates import coordinate_files, write_coordinates
-from chronoscene.scene import WorldFrame
+from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
 
 
@@ -55,11 +55,7 @@ def command(
     """
     system = None if crs is None else read_projected("--crs", crs)
     check_outside(out, [source], option="OUT")
-    frame = None
     with progress_bar(f"read {source}") as bar:
-        if system is not None:  # before OUT is written, which would be in the way of a second try
-            world = read_scene(source, format=dataset_format, period_by=period_by).world
-            frame = _local_frame(world)
         done = convert(
             source,
             out,
@@ -69,25 +65,30 @@ def command(
             image_source=LINKS[link],
             progress=partial(bar, "images"),
             written=() if system is None else coordinate_files(),
+            check=None if system is None else _local_frame,
         )
     # OUT may have other names of images and another split than SRC.
     scene = read_scene(out, format=target)
+    notes = list(done.warnings)
     if system is not None:
+        frame = _local_frame(done.scene)
         write_coordinates(out, scene, frame, system)
+        notes += filter(None, [system.remark_on(frame)])
     lines = [f"{out}: {target} from {done.scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")
     emit("\n".join(lines) + "\n")
-    for warning in done.warnings:
-        show_note(warning)
+    for note in notes:
+        show_note(note)
 
 
-def _local_frame(world: WorldFrame) -> Georeference:
-    """Return the local frame of a registration that world coordinates are in.
+def _local_frame(scene: Scene) -> Georeference:
+    """Return the local frame of a registration that a scene is in.
 
     Raises:
-        ConfigError: If they are in another system, or in none.
+        ConfigError: If it is in another system, or in none.
     """
+    world = scene.world
     frame = from_crs(world.crs)
     if frame is not None and not any(world.offset):
         return frame

@@ -12,6 +12,7 @@ from chronoscene.cli.output import check_place, emit, showing_notes
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
+from chronoscene.geodesy import read_projected
 from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
 from chronoscene.registration.features.camera_groups import AUTO, FEW, MANY, MIN_PHOTOS
@@ -230,4 +231,7 @@ def summary(registered: Registered, out: Path, crs: str | None) -> str:
         lines.append(f"note: {again[0]}" + (f" ({len(again)} like this)" if again[1:] else ""))
     if crs is not None and registered.georeference is None:
         lines.append(f"no coordinates in {crs}: neither GPS nor ground control places the model")
+    elif crs is not None and registered.georeference is not None:
+        remark = read_projected("--crs", crs).remark_on(registered.georeference)
+        lines += [] if remark is None else [f"note: {remark}"]
     return "\n".join(lines) + "\n"

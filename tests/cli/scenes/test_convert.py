@@ -94,6 +94,25 @@ def test_coordinates_in_a_reference_system(make_scene_folder, tmp_path):
     assert "not converted: cameras.csv, certificate.json, georeference.json" in without.stderr
 
 
+def test_coordinates_need_no_second_reading(make_scene_folder, tmp_path, monkeypatch):
+    folder = make_scene_folder()
+    world = {"crs": Georeference(51.0, 11.0, 200.0, "as stated").crs}
+    (folder / "sparse/world.json").write_text(json.dumps(world))
+    original, read = our_format.read, []
+    monkeypatch.setattr(our_format, "read", lambda *a, **k: read.append(a[0]) or original(*a, **k))
+    result = run(folder, tmp_path / "out", "--crs", "EPSG:32632")
+    assert read == [folder, tmp_path / "out"]
+    assert "outside of the area" not in result.stderr
+
+
+def test_a_system_of_another_region_is_remarked_on(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    world = {"crs": Georeference(51.0, 11.0, 200.0, "as stated").crs}
+    (folder / "sparse/world.json").write_text(json.dumps(world))
+    result = run(folder, tmp_path / "out", "--crs", "EPSG:2193")
+    assert "note: the scene is at 51.0000 north, 11.0000 east, outside of the area" in result.stderr
+
+
 def test_points_that_are_not_finite_have_no_coordinates(make_scene_folder, tmp_path):
     scene = read_scene(make_scene_folder())
     scene.points.xyz[0] = np.nan
