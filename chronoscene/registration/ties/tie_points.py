@@ -29,17 +29,20 @@ COLUMNS = {
     "image": ("image", "image name", "image_name", "file", "photo"),
     "x": ("x", "im_x", "u", "col"),
     "y": ("y", "im_y", "v", "row"),
-    "world x": ("world x", "world_x", "wx", "geo_x", "east", "easting", "longitude", "lon"),
-    "world y": ("world y", "world_y", "wy", "geo_y", "north", "northing", "latitude", "lat"),
-    "world z": ("world z", "world_z", "wz", "geo_z", "up", "height", "altitude", "elevation"),
+    "world x": ("world x", "world_x", "wx", "geo_x", "e", "east", "easting", "longitude", "lon"),
+    "world y": ("world y", "world_y", "wy", "geo_y", "n", "north", "northing", "latitude", "lat"),
+    "world z": ("world z", "world_z", "wz", "geo_z", "h", "up", "height", "altitude", "elevation"),
     "role": ("role",),
     "sigma x": ("sx", "sigma_x", "accuracy_x"),
     "sigma y": ("sy", "sigma_y", "accuracy_y"),
     "sigma z": ("sz", "sigma_z", "accuracy_z"),
 }
 """Names of columns, in lower case; upper-case X, Y, Z are world coordinates, unless no other
-column can be the pixels. So are E, N, h, as in the tables that `coordinates` writes."""
+column can be the pixels."""
 
+WORLD = ("world x", "world y", "world z")
+
+_CRS = re.compile(r"#\s*(?:crs(?:\s*[:=]|\s)\s*(?=\S)|(?=EPSG:\d+$))(.+)", re.IGNORECASE)
 _TODO_CSV = "write lines such as: corner1,2016/IMG_0001.jpg,812.5,334.0"
 _TODO_SEPARATORS = "separate the fields by commas, and write decimals with a point"
 _TODO_ODM = "write lines such as: 544256.7 5320919.9 5.0 3044.5 2622.0 IMG_0525.jpg gcp01"
@@ -147,11 +150,7 @@ def read_tie_points(
         crs = _projection(path, filled[0][1])
         rows = _odm_rows(path, filled[1:])
     else:
-        named = (
-            (n, found[1].strip())
-            for n, line in filled
-            if (found := re.fullmatch(r"#\s*crs(?:\s*[:=]|\s)\s*(.+)", line, re.IGNORECASE))
-        )
+        named = ((n, found[1].strip()) for n, line in filled if (found := _CRS.fullmatch(line)))
         crs = next((read_reference_system(f"{path}:{n}", text) for n, text in named), crs)
         rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")])
     scaled = (
@@ -234,6 +233,7 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
     if order is None:
         order, width = {name: i for i, name in enumerate(COLUMNS)}, len(COLUMNS)
     else:
+        _check_world(path, order, *cells[0], [row for _, row in cells[1:]])
         width, cells = len(cells[0][1]), cells[1:]
     for number, row in cells:
         if any(row[width:]):
@@ -243,7 +243,7 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
             )  # fmt: skip
         if len(row) <= max(order[name] for name in ("point", "image", "x", "y")):
             found = f"{len(row)} fields"
-            todo = _TODO_SEPARATORS if ";" in "".join(row) else _TODO_CSV
+            todo = _todo(row)
             raise _wrong(path, number, "point id, image, x, y", found, todo)
         point, image = row[order["point"]], row[order["image"]]
         cell = {name: row[i] for name, i in order.items() if i < len(row)}
@@ -289,9 +289,9 @@ def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | Non
     order: dict[str, int] = {}
     others = {name.lower() for name in row if name not in ("X", "Y", "Z")}
     has_pixels = not others.isdisjoint((*COLUMNS["x"], *COLUMNS["y"]))
-    world = dict(zip("ENhXYZ", 2 * ("world x", "world y", "world z"), strict=True))
+    world = dict(zip("XYZ", WORLD, strict=True))
     for i, name in enumerate(row):
-        if name in world and (has_pixels or name not in "XYZ"):
+        if name in world and has_pixels:
             order[world[name]] = i
             continue
         for key, names in COLUMNS.items():
@@ -307,9 +307,26 @@ def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | Non
         raise _wrong(
             path, number, "a header with point, image, x, y, or a line of data",
             f"no {', '.join(missing)} in {','.join(row)[:80]!r}",
-            _TODO_SEPARATORS if ";" in "".join(row) else _TODO_CSV,
+            _todo(row),
         )  # fmt: skip
     return order
+
+
+def _check_world(
+    path: Path, order: Mapping[str, int], number: int, head: Sequence[str], rows: list[list[str]]
+) -> None:
+    """Refuse columns that may be world coordinates under names that are not known."""
+    others = [
+        name
+        for i, name in enumerate(head)
+        if i not in order.values()
+        and any(_is_number(cell) for row in rows for cell in row[i : i + 1])
+    ]
+    if len(others) >= len(WORLD) and order.keys().isdisjoint(WORLD):
+        raise _wrong(
+            path, number, "E, N, h, or another known name of each column of world coordinates",
+            f"columns of numbers that are not known: {', '.join(others)}", "rename or remove them",
+        )  # fmt: skip
 
 
 def _odm_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
@@ -418,6 +435,11 @@ def _names_of(image: str, names: Sequence[str]) -> list[str]:
 def _ending(name: str, names: Sequence[str]) -> list[str]:
     """Return the name itself, if it is there, or those of which it is the end."""
     return [name] if name in names else [n for n in names if n.endswith(f"/{name}")]
+
+
+def _todo(row: Sequence[str]) -> str:
+    """Return advice on a line with too few fields."""
+    return _TODO_SEPARATORS if re.search(r"[;\t]", "".join(row)) else _TODO_CSV
 
 
 def _second_click(path: Path, point: str, click: Click, first: int) -> SceneError:

@@ -131,6 +131,8 @@ def test_odm_list(tmp_path: Path) -> None:
         ("point,image,x,y,lon,lat,easting\np,a.jpg,1,2,3,4,5\n", 1, "found lon and easting"),
         ("p,a.jpg,1,2,3,4,5\np,b.jpg,1,2,3,4,6\n", 2, "same world coordinates"),
         ("image,x,y\na.jpg,1,2\n", 1, "no point"),
+        ("point\timage\tx\ty\np\ta.jpg\t1\t2\n", 1, "separate the fields by commas"),
+        ("point,image,x,y,R,Hochwert,Hoehe\np,a.jpg,1,2,3,4,5\n", 1, "known: R, Hochw"),
         ("point,image,x,y,X,Y,Z,role\np,a.jpg,1,2,3,4,5,guess\n", 2, "'guess'"),
         ("point,image,x,y,X,Y,Z,role\np,a.jpg,1,2,,,,check\n", 2, "coordinates of the check"),
         ("p,a.jpg,1,2,3,4,5,check\np,b.jpg,1,2,3,4,5,control\n", 2, "control after check"),
@@ -155,6 +157,18 @@ def test_files_without_clicks(tmp_path: Path, text: str) -> None:
         read(tmp_path, text)
 
 
+def test_other_columns_do_not_count(tmp_path: Path) -> None:
+    for names, values in (("by,seen,blurred", "me,3,4"), ("X,Y,Z,dX,dY,dZ", "3,4,5,6,7,8")):
+        (point,) = read(tmp_path, f"point,image,x,y,{names}\np,a.jpg,1,2,{values}\n").points
+        assert point.world == ((3.0, 4.0, 5.0) if "X" in names else None)
+
+
+@pytest.mark.parametrize("line", ["# crs: EPSG:32632", "#CRS EPSG:32632", "# EPSG:32632"])
+def test_a_comment_names_the_reference_system(tmp_path: Path, line: str) -> None:
+    crs = read(tmp_path, f"# measured in May\n{line}\np,a.jpg,1,2,3,4,5\n").crs
+    assert crs is not None and crs.text == "EPSG:32632"
+
+
 def test_a_role_may_stand_before_the_coordinates(tmp_path: Path) -> None:
     lines = ["p,a.jpg,1,2,,,,check", "p,b.jpg,1,2,3,4,5,"]
     for order in (lines, lines[::-1]):
@@ -168,7 +182,13 @@ def test_empty_fields_at_the_end_of_a_line_do_not_count(tmp_path: Path) -> None:
 
 
 def test_usual_names_of_world_coordinates(tmp_path: Path) -> None:
-    for names in ("Easting,Northing,Elevation", "lon,lat,height", "east,north,up", "E,N,h"):
+    for names in (
+        "Easting,Northing,Elevation",
+        "lon,lat,height",
+        "east,north,up",
+        "E,N,H",
+        "e,n,h",
+    ):
         (point,) = read(tmp_path, f"point,image,x,y,{names}\np,a.jpg,1,2,3,4,5\n").points
         assert point.world == (3.0, 4.0, 5.0)
 
