@@ -17,6 +17,7 @@ from chronoscene.survey.map_frame import MapFrame
 
 NODATA = -9999.0
 WHOLE = "whole area"  # Name of the volumes of the whole map
+ON_MAP = "a polygon on the map"
 
 
 class Polygon(NamedTuple):
@@ -84,10 +85,10 @@ def read_polygons(path: Path, grid: Grid, frame: MapFrame) -> dict[str, Polygon]
         shape = _on_map(place, data.get("crs"), feature, frame)
         cells = geometry_mask([shape], *raster, invert=True)
         if not cells.any():
-            found, todo = "one outside", "check its coordinates"
             if geometry_mask([shape], *raster, invert=True, all_touched=True).any():
                 found, todo = "one without the centre of a cell", "choose a finer --resolution"
-            raise _wrong(place, "a polygon on the map", found, todo)
+                raise _wrong(place, ON_MAP, found, todo)
+            raise _outside(place)
         properties = feature.get("properties")
         given = properties.get("name") if isinstance(properties, dict) else None
         name = str(number if given is None else given)
@@ -128,8 +129,7 @@ def _on_map(place: str, system: Any, feature: Any, frame: MapFrame) -> Any:
     from rasterio.warp import transform_geom
 
     shape = feature.get("geometry", feature) if isinstance(feature, dict) else {}
-    polygon = isinstance(shape, dict) and shape.get("type") in ("Polygon", "MultiPolygon")
-    if not polygon or not is_valid_geom(shape):
+    if not _is_polygon(shape) or not is_valid_geom(shape):
         raise _wrong(place, "a polygon of GeoJSON", "none", "draw areas as polygons")
     left, bottom, right, top = bounds(shape)
     angles = max(-left, right) <= 180 and max(-bottom, top) <= 90
@@ -145,6 +145,30 @@ def _on_map(place: str, system: Any, feature: Any, frame: MapFrame) -> Any:
         if frame.is_local:
             wanted, todo = "no crs, as the scene has none", "draw them in the metres of the scene"
         raise _wrong(place, wanted, repr(system)[:80], todo) from error
+    except Exception as error:  # of classes that rasterio keeps to itself
+        raise _outside(place) from error
+
+
+def _is_polygon(shape: Any) -> bool:
+    """Return True for a polygon whose corners are numbers: GDAL ends the process at others."""
+    kind = shape.get("type") if isinstance(shape, dict) else None
+    if kind not in ("Polygon", "MultiPolygon"):
+        return False
+    inner = [shape.get("coordinates")]
+    for _ in range(3 if kind == "MultiPolygon" else 2):
+        if not all(isinstance(item, list) and item for item in inner):
+            return False
+        inner = [part for item in inner for part in item]
+    return all(
+        isinstance(corner, list)
+        and len(corner) >= 2
+        and all(isinstance(x, int | float) and abs(x) < np.inf for x in corner)
+        for corner in inner
+    )
+
+
+def _outside(place: str) -> ConfigError:
+    return _wrong(place, ON_MAP, "one outside", "check its coordinates")
 
 
 def _wrong(place: str, expected: str, found: str, todo: str) -> ConfigError:
