@@ -31,6 +31,7 @@ PERIOD_GAP_DAYS = 14  # In one folder of photos, a gap of so many days begins a 
 
 OTHERS = (
     *(*HEIF_SUFFIXES, ".avif", ".jxl", ".dng"),
+    *(".jfif", ".jp2", ".jpe", ".mpo"),
     *(".arw", ".cr2", ".cr3", ".nef", ".orf", ".raf", ".rw2"),
 )
 """Extensions of photos that are left out if the same photo is there in another form, or if they
@@ -133,7 +134,7 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
     if table is not None:
         return _assemble(path, _from_table(path, table))
     photos = photos_in(path)
-    unread = _unread(path, photos)
+    unread = [*_unread(path, photos), *_broken_links(path)]
     groups, left_out = _period_folders(path, photos)
     if groups:
         return _assemble(path, groups, left_out=[*left_out, *unread])
@@ -147,7 +148,7 @@ def photos_in(folder: Path) -> list[Path]:
     Phones write HEIC, and AVIF is alike: these are listed if they can be read, and if the same
     photo is not there in another form. Files in ``masks/`` are masks if there are other photos.
     """
-    files = list(_files_in(folder))
+    files = [p for p in _files_in(folder) if p.is_file()]
     photos = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES]
     known = {p.with_suffix("") for p in photos}
     others = [p for p in files if _is_read(p.suffix.lower()) and p.with_suffix("") not in known]
@@ -163,7 +164,8 @@ def _is_read(suffix: str) -> bool:
 
 
 def _files_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
-    """Yield the files below a folder; ``above`` are those around it, to which links may lead."""
+    """Yield the files below a folder, and links to none; ``above`` are the folders around it, to
+    which links may lead."""
     real = folder.resolve()
     if real in above or not real.is_dir():
         return
@@ -172,7 +174,7 @@ def _files_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
             continue
         if path.is_dir():
             yield from _files_in(path, (*above, real))
-        elif path.is_file():
+        elif path.is_file() or path.is_symlink():
             yield path
 
 
@@ -189,6 +191,18 @@ def _unread(root: Path, photos: Sequence[Path]) -> list[str]:
         f"{counted(len(found), 'photo')} in formats that are not read ({', '.join(suffixes)}), "
         f"such as {found[0].relative_to(root)}; they are left out; "
         + (HEIF_TODO if with_package else "convert them to JPEG")
+    ]
+
+
+def _broken_links(root: Path) -> list[str]:
+    """Name links to photos that are not there; nothing if there are none."""
+    links = (p for p in sorted(_files_in(root)) if not p.is_file())
+    found = [p for p in links if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not found:
+        return []
+    return [
+        f"{counted(len(found), 'link')} to photos that are missing, such as "
+        f"{found[0].relative_to(root)}; they are left out; copy the photos, or connect their disk"
     ]
 
 

@@ -11,7 +11,7 @@ from chronoscene.errors import SceneError
 from chronoscene.images.decoding import load_rgb
 from chronoscene.registration.photos import captures as captures_module
 from chronoscene.registration.photos import photo as photo_module
-from chronoscene.registration.photos.captures import read_captures
+from chronoscene.registration.photos.captures import photos_of, read_captures
 from chronoscene.registration.photos.inputs import place_photos
 
 
@@ -44,6 +44,23 @@ def test_folders_may_be_links(tmp_path: Path) -> None:
     (tmp_path / "site" / "2016" / "up").symlink_to(tmp_path / "site")
     found = read_captures(tmp_path / "site")
     assert [c.name for c in found.images] == ["2016/a.jpg", "2023/b.jpg"]
+
+
+def test_links_to_photos_that_are_missing_are_named(tmp_path: Path) -> None:
+    for name in ("2016/a.jpg", "2016/b.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).symlink_to(tmp_path / "unmounted" / name)
+    with pytest.raises(
+        SceneError, match="found 2 links to photos that are missing, such as 2016/a"
+    ):
+        read_captures(tmp_path)
+    (tmp_path / "2016/a.jpg").unlink()
+    for name in ("2016/a.jpg", "2023/a.jpg"):
+        photo(tmp_path / name)
+    found = read_captures(tmp_path)
+    assert [c.name for c in found.images] == ["2016/a.jpg", "2023/a.jpg"]
+    assert found.notes[0].startswith("1 link to photos that are missing, such as 2016/b.jpg")
+    assert photos_of(tmp_path, None) == [tmp_path / "2016/a.jpg", tmp_path / "2023/a.jpg"]
 
 
 def test_photos_in_formats_that_are_not_read_are_named(tmp_path: Path) -> None:
