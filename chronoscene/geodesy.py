@@ -115,7 +115,7 @@ class ReferenceSystem:
         return (
             f"the scene is at {frame.latitude:.4f} north, {frame.longitude:.4f} east, outside of "
             f"the area of {self.text} ({area.south:g} to {area.north:g} north, {area.west:g} to "
-            f"{area.east:g} east): coordinates in it are distorted or wrong"
+            f"{area.east:g} east): coordinates in it may be distorted or wrong"
         )
 
     def derivative(self, frame: Georeference, enu: Array) -> Array:
