@@ -253,6 +253,7 @@ def _from_table(root: Path, table: Path) -> list[_Listed]:
                 found=f"{name!r}, {label!r}",
                 todo="correct the line; paths are relative to the folder of the captures",
             )
+        name = PurePosixPath(name).as_posix()  # ./a.jpg and a.jpg are one photo
         if name in listed and listed[name].label != label:
             raise SceneError(
                 place,
@@ -260,7 +261,7 @@ def _from_table(root: Path, table: Path) -> list[_Listed]:
                 found=f"{listed[name].label!r} and {label!r}",
                 todo="keep one of the two lines",
             )
-        listed[name] = _Listed(file, PurePosixPath(name).as_posix(), label, Path(place).name)
+        listed[name] = _Listed(file, name, label, Path(place).name)
     return list(listed.values())
 
 

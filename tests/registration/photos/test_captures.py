@@ -230,6 +230,7 @@ def test_a_table_gives_periods(tmp_path: Path) -> None:
         ("image,period\n../x.jpg,0\n", "t.csv:2", "'../x.jpg'"),
         ("image,period\na.jpg,\n", "t.csv:2", "''"),
         ("image,period\na.jpg,0\na.jpg,1\n", "t.csv:3", "'0' and '1'"),
+        ("image,period\na.jpg,0\n./a.jpg,1\n", "t.csv:3", "'0' and '1'"),
     ],
 )
 def test_wrong_tables_are_refused(tmp_path: Path, text: str, place: str, found: str) -> None:
