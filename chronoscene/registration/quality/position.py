@@ -42,6 +42,11 @@ _COMPARE = (
 )
 _CHECK = "set some surveyed points aside as check points: role check in the file of --tie-points"
 
+_SYSTEM = "check the reference system of the points, and the order east, north, height"
+
+UPWARDS = 0.5
+"""Mean sine of the elevations of all views, above which the photos look at what is above them."""
+
 _MOST_AGREE = "the other control points agree with each other, but not with it"
 
 POSITION_THRESHOLDS: dict[str, Threshold] = {
@@ -74,7 +79,7 @@ POSITION_THRESHOLDS: dict[str, Threshold] = {
         what="horizontal distance of the surveyed position from GPS, median",
         unit="m", doubtful=15, fail=100,
         why="receivers err by metres; more comes from another reference system, or exchanged axes",
-        todo="check the reference system of the points, and the order east, north, height",
+        todo=_SYSTEM,
     ),
     "scale": Threshold(
         what="standard deviation of the scale by GPS",
@@ -168,6 +173,7 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     pixels = [r.ground_pixel for r in points if r.ground_pixel is not None]
     pixel = float(np.median(pixels)) if pixels else None
     objections = [
+        *(_turned_over(model) if controlled else ()),
         *_errors("check points", found, pixel),
         *_errors("control points", control, pixel),
         *contradicted(model, POSITION_THRESHOLDS["left_out"]),
@@ -263,6 +269,16 @@ def _errors(place: str, rmse: Rmse | None, pixel: float | None) -> Iterator[Obje
     for key, value in (("horizontal", rmse.horizontal), ("vertical", rmse.vertical)):
         note = f" ({value:.3g} m; largest error {rmse.largest:.3g} m, {rmse.worst})"
         yield from check(POSITION_THRESHOLDS[key], value / pixel, place, key, note)
+
+
+def _turned_over(model: Registered) -> Iterator[Objection]:
+    """An objection to control that places the ground above the cameras."""
+    if float(model.cam_from_world[:, 2, 2].mean()) > UPWARDS:
+        yield Objection(
+            "doubtful", "upwards", "the photos", "all in all, they look up from below the points",
+            "control on flat ground whose east and north are exchanged fits a model that is "
+            "turned over", _SYSTEM,
+        )  # fmt: skip
 
 
 def _rejected(points: Sequence[PointResidual]) -> Iterator[Objection]:

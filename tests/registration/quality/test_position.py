@@ -93,6 +93,27 @@ def test_exact_control_and_check_points_pass(tmp_path: Path, made: Generated) ->
     assert position.ground_pixel == pytest.approx(0.2, abs=0.1)
 
 
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_control_on_flat_ground_with_exchanged_axes_turns_the_model_over(
+    tmp_path: Path, made: Generated, exchanged: bool
+) -> None:
+    rows = ["point,image,x,y,X,Y,Z"]
+    for k, place in enumerate(PLACES * [1.0, 1.0, 0.0]):
+        x, y, z = place[[1, 0, 2]] if exchanged else place
+        for name, pose in zip(made.model.names, made.truth, strict=True):
+            local = pose[:3, :3] @ place + pose[:3, 3]
+            u, v = 400 * local[:2] / local[2] + [240, 180]
+            if 0 < u < 480 and 0 < v < 360:
+                rows.append(f"c{k},{name},{u},{v},{x},{y},{z}")
+    (tmp_path / "s.csv").write_text("\n".join(rows))
+    model = replace(made.model, georeference=None)
+    ties = align_with_tie_points(model, read_tie_points(tmp_path / "s.csv"))
+    position = judge_position(ties.model, ties)
+    assert ties.controlled and position.control is not None and position.control.horizontal < 0.3
+    assert ("look up from below" in position.text) == exchanged
+    assert ("order east, north, height" in position.todo[0]) == exchanged
+
+
 def test_control_alone_is_optimistic(tmp_path: Path, made: Generated) -> None:
     _, position = judged(made.model, survey(tmp_path / "s.csv", made))
     assert position.level == "doubtful"
