@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.splat_files.rotations import with_largest, without_largest
 
 PALETTE_COLUMNS = 64
 """Rows of the palette in a line of its image."""
 MAX_PALETTE = 65_536
 
-_OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
-"""The components of a quaternion but the i-th. [4, 3]"""
 _LARGEST = 252
 """Alpha of a rotation whose largest component is w; 253 to 255 for x, y, z."""
 _ROUNDS = 6
@@ -179,17 +178,11 @@ def _nearest(rows: NDArray[np.float32], palette: NDArray[np.float32]) -> NDArray
 def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Pack quaternions wxyz: the three smaller components, and which is left out. [N, 4]"""
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    largest, rows = np.abs(quats).argmax(axis=1), np.arange(len(quats))
-    others = quats[rows[:, None], _OTHERS[largest]]
-    others = others * np.sign(quats[rows, largest])[:, None]
+    largest, others = without_largest(quats)
     levels = np.rint((others / np.sqrt(2) + 0.5) * 255).clip(0, 255)
     return np.column_stack([levels, _LARGEST + largest]).astype(np.uint8)
 
 
 def _unpack_rotations(pixels: NDArray[np.int64]) -> NDArray[np.float32]:
     others = (pixels[:, :3] / 255 - 0.5) * np.sqrt(2)
-    largest, rows = pixels[:, 3] - _LARGEST, np.arange(len(pixels))
-    quats = np.empty((len(pixels), 4))
-    quats[rows[:, None], _OTHERS[largest]] = others
-    quats[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
-    return quats.astype(np.float32)
+    return with_largest(pixels[:, 3] - _LARGEST, others).astype(np.float32)

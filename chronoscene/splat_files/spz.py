@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.splat_files.rotations import with_largest, without_largest
 
 MAGIC, VERSION, SH_DEGREE, ANTIALIASED = 0x5053474E, 3, 3, 1
 
@@ -39,8 +40,6 @@ _SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.f
 _SH_STEPS = np.array([8] * 3 + [16] * 12)
 """Multiples that the stored bytes of degree 1 and of the others have. [15]"""
 _AT_A_TIME = 1 << 16  # Gaussians of which harmonics are packed together, so that copies stay small
-_OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
-"""The components of a quaternion but the i-th. [4, 3]"""
 
 
 def encode(cloud: GaussianCloud, *, antialiased: bool) -> bytes:
@@ -122,12 +121,9 @@ def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[np.uint32]:
     """
     xyzw = quats[:, [1, 2, 3, 0]] / np.linalg.norm(quats, axis=1, keepdims=True)
     xyzw[:, :3] *= _FLIPPED
-    largest = np.abs(xyzw).argmax(axis=1)
-    rows = np.arange(len(quats))
-    others = xyzw[rows[:, None], _OTHERS[largest]]
-    negative = (others < 0) ^ (xyzw[rows, largest] < 0)[:, None]
+    largest, others = without_largest(xyzw)
     fields = np.rint(np.abs(others) * (511 * np.sqrt(2))).astype(np.uint32)
-    fields |= negative.astype(np.uint32) << 9
+    fields |= (others < 0).astype(np.uint32) << 9
     top, middle, low = fields.T
     return (largest.astype("<u4") << 30 | top << 20 | middle << 10 | low).astype("<u4")
 
@@ -136,9 +132,6 @@ def _unpack_rotations(packed: NDArray[np.uint32]) -> NDArray[np.float32]:
     largest = (packed >> 30).astype(np.int64)
     fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
     others = (fields & 511) / (511 * np.sqrt(2)) * np.where(fields >> 9 & 1, -1, 1)
-    xyzw = np.empty((len(packed), 4))
-    rows = np.arange(len(packed))
-    xyzw[rows[:, None], _OTHERS[largest]] = others
-    xyzw[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
+    xyzw = with_largest(largest, others)
     xyzw[:, :3] *= _FLIPPED
     return xyzw[:, [3, 0, 1, 2]].astype(np.float32)
