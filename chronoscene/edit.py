@@ -144,13 +144,13 @@ def apply(scene: Scene, edits: Edits) -> Edited:
         ConfigError: If a name is unknown, or nothing would be left.
     """
     kept = _kept_images(scene, edits)
-    _check_left(kept, "image", "--keep and --drop", "leave out fewer images or periods")
+    _check_left(kept, "--keep and --drop", "leave out fewer images or periods")
     inside = np.ones(len(scene.points), bool)
     seeing = kept
     if edits.crop is not None:
         inside = _inside(scene.points, edits.crop)
         seeing = kept & ~_sees_only_outside(scene.points, inside, len(kept))
-        _check_left(seeing, "image", "--crop", "choose a larger box")
+        _check_left(seeing, "--crop", "choose a larger box")
     points, unseen = _points_of(scene.points, inside, seeing)
     frames = tuple(f for f, stays in zip(scene.frames, seeing.tolist(), strict=True) if stays)
     labels, images = _renames(scene, edits.rename)
@@ -350,6 +350,6 @@ def _common_date(dates: Sequence[str | None]) -> str | None:
     return None
 
 
-def _check_left(kept: NDArray[np.bool_], noun: str, option: str, todo: str) -> None:
+def _check_left(kept: NDArray[np.bool_], option: str, todo: str) -> None:
     if not kept.any():
-        raise ConfigError(option, expected=f"an {noun} that stays", found="none", todo=todo)
+        raise ConfigError(option, expected="an image that stays", found="none", todo=todo)

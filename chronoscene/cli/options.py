@@ -154,14 +154,12 @@ PLUGIN = click.option(
 )
 
 
-def preset_option(default: str) -> Callable[[click.decorators.FC], click.decorators.FC]:
-    """Make the option ``--preset``."""
-    text = "Preset of the methods, or a file FILE.toml with one."
-    return click.option("--preset", default=default, help=text)
-
+PRESET = click.option(
+    "--preset", default="balanced", help="Preset of the methods, or a file FILE.toml with one."
+)
 
 _TRAINING = {
-    "preset": preset_option("balanced"),
+    "preset": PRESET,
     "iterations": click.option(
         "--iterations", type=click.IntRange(min=1), help="Stop after this many iterations."
     ),

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import PATH, TABLE, preset_option
+from chronoscene.cli.options import PATH, PRESET, TABLE
 from chronoscene.cli.output import check_place, report_written, say
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.runs.bench import BUDGET, MEMORY, WIDTH
@@ -19,7 +19,7 @@ from chronoscene.workflow.steps import Project
 @click.argument("captures", type=PATH)
 @click.argument("out", type=PATH)
 @TABLE
-@preset_option("balanced")
+@PRESET
 @BUDGET
 @WIDTH
 @MEMORY

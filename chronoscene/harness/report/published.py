@@ -57,7 +57,7 @@ class PublishedTable(BaseModel):
     """Contradictions in the paper, or with the files of its authors, by a short id."""
 
 
-def load_published(name: str = "chronogs_paper") -> PublishedTable:
-    """Read a published table that is shipped with this package."""
-    text = files(__package__).joinpath(f"{name}.json").read_text(encoding="utf-8")
+def load_published() -> PublishedTable:
+    """Read the published table that is shipped with this package."""
+    text = files(__package__).joinpath("chronogs_paper.json").read_text(encoding="utf-8")
     return PublishedTable.model_validate_json(text)
