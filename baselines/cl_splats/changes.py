@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from baselines.cl_splats.config import CLSplatsConfig
+from chronoscene.arrays import Mask
 from chronoscene.images.masks import resize_mask
 
 Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 _WIDTH = 640
 """Pixels across the images that are compared at most: the smallest windows then have a standard

@@ -13,9 +13,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from baselines.cl_splats.changes import Mask, changed_pixels
+from baselines.cl_splats.changes import changed_pixels
 from baselines.cl_splats.config import CLSplatsConfig
 from baselines.cl_splats.model import PeriodModel
+from chronoscene.arrays import Array, Mask
 from chronoscene.gaussians.model import initialise
 from chronoscene.methods import Prediction, TrainingSet, TrainingView, View
 from chronoscene.training.devices import to_device
@@ -34,8 +35,6 @@ lies on most rays of changed pixels at one place only."""
 _NEAREST = 0.5
 """Times the depth of what is shown: no point is drawn before that. Few views see what is close to a
 camera."""
-
-Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +140,7 @@ def new_points(
     train: TrainingSet,
     config: CLSplatsConfig,
     generator: np.random.Generator,
-) -> tuple[Points, NDArray[np.uint8]]:
+) -> tuple[Array, NDArray[np.uint8]]:
     """Starting positions of new Gaussians, and their colours. [n, 3], [n, 3]
 
     Sparse points that the new period alone sees, and points drawn on the rays of changed pixels, in
@@ -171,7 +170,7 @@ def new_points(
 
 def _draw(
     found: Sequence[Comparison], config: CLSplatsConfig, generator: np.random.Generator
-) -> tuple[Points, NDArray[np.uint8]]:
+) -> tuple[Array, NDArray[np.uint8]]:
     """Points on rays of changed pixels, and the colours of the pixels. [n, 3], [n, 3]"""
     pixels = [np.argwhere(item.changed & np.isfinite(item.depth)) for item in found]
     counts = np.array([len(places) for places in pixels])
@@ -193,7 +192,7 @@ def _draw(
     return np.concatenate(points), np.concatenate(colors)
 
 
-def _look(points: Points, item: Comparison) -> tuple[Mask, Mask]:
+def _look(points: Array, item: Comparison) -> tuple[Mask, Mask]:
     """Masks of the points in changed pixels of a view, and of those that it sees. [n], [n]"""
     K, pose = item.view.K, item.view.cam_from_world
     x, y, z = ((points[:, None] * pose[:3, :3]).sum(-1) + pose[:3, 3]).T
@@ -206,7 +205,7 @@ def _look(points: Points, item: Comparison) -> tuple[Mask, Mask]:
     return hit, hit | (inside & item.counts[row, column] & ~hidden)
 
 
-def enclose(means: Points, config: CLSplatsConfig, extent: float) -> Points:
+def enclose(means: Array, config: CLSplatsConfig, extent: float) -> Array:
     """Spheres around clusters of points: centre and radius. [N, 3] -> [S, 4]
 
     Cells of a grid that touch are in one cluster.

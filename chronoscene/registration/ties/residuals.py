@@ -15,13 +15,10 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.registration.quality.rays import PlacedPoints, TrackRays, place, project, rays_at
 from chronoscene.registration.result import Registered
-from chronoscene.registration.ties.tie_points import Role, TiePoints
+from chronoscene.registration.ties.tie_points import Place, Role, TiePoints
 
 OUTLIER_PIXELS = 12.0
 """A click with a smaller error is no outlier: people click to within a few pixels."""
-
-
-Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
