@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fresh_process import run_python
 from surveyed import moved
 
 from chronoscene.colmap.binary import read_images, read_points
@@ -33,15 +34,13 @@ def test_zlib_survives_pycolmap_outside_pytest(last):
     """pycolmap 4.2.1 aborts the process here unless zlib was loaded before it."""
     code = "import chronoscene.colmap.model, zlib, numpy, io; f = io.BytesIO(); "
     code += f"{last}; print('alive')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout) == (0, "alive\n"), done.stderr
+    assert run_python(code) == "alive\n"
 
 
 def test_the_package_alone_makes_pycolmap_safe():
     """Whatever else a script imports after it: the package itself loads zlib."""
     code = "import chronoscene, pycolmap, zlib; zlib.compress(b'x' * 1000); print('alive')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout) == (0, "alive\n"), done.stderr
+    assert run_python(code) == "alive\n"
 
 
 @pytest.mark.parametrize("handler", ["lambda *_: sys.exit(7)", "signal.SIG_DFL"])

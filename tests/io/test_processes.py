@@ -6,10 +6,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from waiting import wait_for
 
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.io.processes import Outcome, map_parallel, run_worker, stoppable
@@ -179,15 +179,8 @@ def test_a_worker_ends_with_its_parent_even_if_that_is_killed(jobs, tmp_path):
         f"run_worker('some_jobs:sleeps', {{'mark': {str(mark)!r}}})\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code])
-    wait_until(lambda: mark.exists() and mark.read_text() != "")
+    wait_for(lambda: mark.exists() and mark.read_text() != "")
     worker = int(mark.read_text())
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    wait_until(lambda: not Path(f"/proc/{worker}").exists())
-
-
-def wait_until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_for(lambda: not Path(f"/proc/{worker}").exists())

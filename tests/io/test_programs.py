@@ -4,10 +4,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from waiting import wait_for
 
 from chronoscene.errors import ProgramError
 from chronoscene.io.processes import end_processes, process_tree
@@ -28,15 +28,6 @@ subprocess.run([sys.executable, "-c", sys.argv[1]])
 
 def run(command, tmp_path):
     return run_program(command, folder=tmp_path, log=tmp_path / "log.txt")
-
-
-def wait_for(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if found := condition():
-            return found
-        time.sleep(0.02)
-    raise AssertionError("waited in vain")
 
 
 def test_a_program_runs_in_its_folder_and_its_output_is_kept(tmp_path):

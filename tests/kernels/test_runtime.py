@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import psutil
 import pytest
+from fresh_process import run_python
 
 from chronoscene.kernels import runtime
 
@@ -30,10 +28,7 @@ print(faults() - before)
 
 
 def new_pages(mode: str) -> int:
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, mode], capture_output=True, text=True, check=True
-    )
-    return int(done.stdout)
+    return int(run_python(PROGRAM, mode))
 
 
 def test_memory_is_kept() -> None:

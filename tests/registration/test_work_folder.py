@@ -5,13 +5,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from waiting import wait_for
 
 from chronoscene.errors import DiskFullError, RegistrationError
 from chronoscene.registration.work_folder import TASKS, Stages, run_task, work_folder
@@ -177,18 +176,11 @@ def test_a_task_dies_with_the_process_that_asked_for_it(tmp_path: Path) -> None:
     )
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path)
     mark = tmp_path / "mark"
-    wait_until(lambda: mark.exists() and mark.read_text() != "")
+    wait_for(lambda: mark.exists() and mark.read_text() != "")
     child = int(mark.read_text())
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    wait_until(lambda: not is_alive(child))
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_for(lambda: not is_alive(child))
 
 
 def is_alive(process: int) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fresh_process import run_python
 
 import chronoscene
 from chronoscene.errors import ImageError
@@ -147,8 +148,7 @@ def test_peak_memory_follows_allocations():
         "before = peak_memory_bytes(); block = np.ones(before + 200_000_000, np.uint8); "
         "print(peak_memory_bytes() - before)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert int(done.stdout) > 150_000_000
+    assert int(run_python(code)) > 150_000_000
 
 
 def test_a_system_whose_memory_is_unknown(monkeypatch):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from waiting import wait_for
 
 from chronoscene.errors import DiskFullError
 from chronoscene.harness.files.records import read_run
@@ -18,7 +19,6 @@ from chronoscene.harness.run import local_pool
 from chronoscene.io.processes import process_tree
 
 from ..plan.test_job import JOB
-from ..train.test_interruption import wait_for
 
 FILES = ("checkpoint/model.json", "predictions/manifest.json", "rows.csv", "source.json")
 

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import psutil
 import pytest
 from training_here import execute_here
+from waiting import wait_for
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import read_run
@@ -21,7 +22,6 @@ from chronoscene.harness.run.runner import run_bench
 from chronoscene.io.processes import process_tree
 
 from ..plan.test_job import JOB
-from ..train.test_interruption import wait_for
 
 pytest.importorskip("ray")
 NODE = {"object_store_memory": 80_000_000, "include_dashboard": False}

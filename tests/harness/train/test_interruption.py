@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from waiting import wait_for
 
 from chronoscene.harness.files.records import read_run, run_folders
 from chronoscene.io.processes import process_tree
@@ -32,15 +33,6 @@ run_bench(
     lambda line: print(line, flush=True),
 )
 """
-
-
-def wait_for(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if found := condition():
-            return found
-        time.sleep(0.05)
-    raise AssertionError("waited in vain")
 
 
 def workers_of(pid):

@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import warnings
 from contextlib import ExitStack
 from dataclasses import replace
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
+from waiting import wait_for
 
 from chronoscene.cli import cli
 from chronoscene.errors import ChronoSceneError, ConfigError
@@ -59,13 +59,6 @@ def enter(server):
     return browser
 
 
-def until(found, seconds=20.0):
-    end = time.monotonic() + seconds
-    while not found():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def equals(image):
     return lambda other: np.abs(other - image).max() == 0
 
@@ -92,10 +85,10 @@ def test_each_browser_has_a_state_of_its_own(trained, serve):
         first.picture(differs(start))
         second.look(server._content.start()[0])  # asks again
         second.picture(equals(start))
-        until(lambda: len(server.viewers) == 2)
+        wait_for(lambda: len(server.viewers) == 2)
         second.drop()
-        until(lambda: len(server.viewers) == 1)
-        until(lambda: len(server._worker._seats) == 1)
+        wait_for(lambda: len(server.viewers) == 1)
+        wait_for(lambda: len(server._worker._seats) == 1)
         first.set("Period", 0.0)
         first.picture(equals(start))
 
@@ -179,10 +172,10 @@ def test_a_saved_path_is_one_of_render(trained, serve, tmp_path):
     view = viewer._now()
     for period in (0.0, 1.0):
         browser.set("Period", period)
-        until(lambda period=period: viewer._now().period == period)
+        wait_for(lambda period=period: viewer._now().period == period)
         viewer._keep([*viewer._views, viewer._now()])
     browser.set("Seconds", 1.0)
-    until(lambda: viewer._seconds.value == 1.0)
+    wait_for(lambda: viewer._seconds.value == 1.0)
     viewer._send_path()
     part = browser.wait(lambda: browser.of("FileTransferPart"))[0]
     (tmp_path / "path.json").write_bytes(part["content"])
@@ -247,26 +240,26 @@ def test_in_chromium(trained, serve, browser):
     problems = []
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.goto(f"http://127.0.0.1:{server.port}")
-    until(lambda: server.viewers, 30)
+    wait_for(lambda: server.viewers)
     (viewer,) = server.viewers.values()
 
     def shown():
         corner = {"x": 0, "y": 200, "width": 200, "height": 100}
         return np.asarray(Image.open(io.BytesIO(page.screenshot(clip=corner)))).astype(int)
 
-    until(lambda: np.ptp(shown()) > 20, 30)
+    wait_for(lambda: np.ptp(shown()) > 20)
     before, pose = shown(), viewer._now().pose
     period = page.get_by_text("Period", exact=True).locator("xpath=ancestor::*[.//input][1]//input")
     period.last.fill("1")
     period.last.press("Enter")
-    until(lambda: np.abs(shown() - before).mean() > 2)
+    wait_for(lambda: np.abs(shown() - before).mean() > 2)
     page.mouse.move(100, 250)
     page.mouse.down()
     page.mouse.move(180, 250, steps=4)
     page.mouse.up()
-    until(lambda: np.abs(viewer._now().pose - pose).max() > 0.01)
+    wait_for(lambda: np.abs(viewer._now().pose - pose).max() > 0.01)
     page.close()
-    until(lambda: not server.viewers)
+    wait_for(lambda: not server.viewers)
     assert not problems
 
 

@@ -5,6 +5,7 @@ import time
 from concurrent.futures import CancelledError
 
 import pytest
+from waiting import wait_for
 
 from chronoscene.harness.view.worker import FULL, LEAST, SHARE, UPDATES, RenderWorker, Resolution
 
@@ -16,13 +17,6 @@ def worker():
     made = RenderWorker()
     yield made
     made.stop()
-
-
-def until(found, seconds=5.0):
-    end = time.monotonic() + seconds
-    while not found():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 def draw(resolution, fixed, per_pixel, *, moving=1, pictures=40):
@@ -74,7 +68,7 @@ def test_the_worker_learns_what_takes_its_time_anyway(worker):
 
     for number in range(1, 13):
         worker.request("a", decode, SIZE)
-        until(lambda number=number: len(pixels) >= number)
+        wait_for(lambda number=number: len(pixels) >= number)
     assert pixels[2] < pixels[0] < pixels[11]
 
 
@@ -90,7 +84,7 @@ def test_only_the_newest_request_is_drawn(worker):
     for number in range(10):
         worker.request("a", lambda pixels, number=number: drawn.append(number), (8, 8))
     go.set()
-    until(lambda: drawn)
+    wait_for(lambda: drawn)
     time.sleep(0.05)
     assert drawn == [9]
 
@@ -98,7 +92,7 @@ def test_only_the_newest_request_is_drawn(worker):
 def test_a_picture_at_rest_becomes_complete_and_then_nothing_is_drawn(worker):
     pixels = []
     worker.request("a", pixels.append, SIZE)
-    until(lambda: pixels and pixels[-1] == 400 * 400)
+    wait_for(lambda: pixels and pixels[-1] == 400 * 400)
     assert pixels == [320 * 240, 400 * 400]
     time.sleep(0.3)
     assert len(pixels) == 2
@@ -107,7 +101,7 @@ def test_a_picture_at_rest_becomes_complete_and_then_nothing_is_drawn(worker):
 def test_a_small_canvas_is_complete_at_once(worker):
     pixels = []
     worker.request("a", pixels.append, (20, 10))
-    until(lambda: pixels)
+    wait_for(lambda: pixels)
     time.sleep(0.25)
     assert pixels == [200]
 
@@ -126,7 +120,7 @@ def test_viewers_take_turns(worker):
 
     ask("a")
     ask("b")
-    until(lambda: len(order) >= 20)
+    wait_for(lambda: len(order) >= 20)
     assert 8 <= order[:20].count("a") <= 12
 
 
