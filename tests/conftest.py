@@ -88,11 +88,39 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 @pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    """Sets how many threads kernels have; the test is skipped where there are not so many."""
+    import numba
+
+    def set_threads(number: int) -> None:
+        if number > numba.config.NUMBA_NUM_THREADS:  # type: ignore[attr-defined]
+            pytest.skip(f"needs {number} threads")
+        numba.set_num_threads(number)
+
+    before = numba.get_num_threads()
+    yield set_threads
+    numba.set_num_threads(before)
+
+
+@pytest.fixture
 def one_thread() -> Iterator[None]:
     """Small scenes are quicker on one thread, most of all beside other work."""
     runtime.set_threads(1)
     yield
     runtime.set_threads()
+
+
+@pytest.fixture
+def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The code of a GPU, on a CPU."""
+    monkeypatch.setattr("chronoscene.training.devices.has_kernels", lambda *tensors: False)
+
+
+@pytest.fixture(params=["compiled", "torch"])
+def both_codes(request: pytest.FixtureRequest) -> None:
+    """The code of a CPU, then that of a GPU."""
+    if request.param == "torch":
+        request.getfixturevalue("without_kernels")
 
 
 @pytest.fixture

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import pytest
 import torch
 from hypothesis import given, settings
@@ -363,15 +363,14 @@ def test_offsets_that_are_not_used_are_off() -> None:
     assert torch.equal(index, (used & (whole.opacities > 0)).nonzero()[:, 0])
 
 
-def test_active_over_several_chunks_and_threads() -> None:
+def test_active_over_several_chunks_and_threads(threads: Callable[[int], None]) -> None:
     problem = make_problem(anchors=3 * CHUNK, visible=2 * CHUNK + 77, offsets=5)
     with torch.no_grad():
         problem.heads[0].b2.sub_(0.5)
-    previous = numba.get_num_threads()
-    numba.set_num_threads(1)
+    threads(1)
     one, _, one_grads = active_gradients(problem, decode_active)
     one_grads = {name: grad.clone() for name, grad in one_grads.items()}
-    numba.set_num_threads(previous)
+    threads(2)
     many, _, many_grads = active_gradients(problem, decode_active)
     assert 0 < len(one.means) < 5 * (2 * CHUNK + 77)
     assert all(torch.equal(a, b) for a, b in zip(one, many, strict=True))
@@ -399,17 +398,13 @@ def test_not_a_number_is_active() -> None:
     assert bool(out.opacities[3:].isfinite().all())
 
 
-def test_same_bits_for_any_thread_count() -> None:
-    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
-        pytest.skip("one processor only")
+def test_same_bits_for_any_thread_count(threads: Callable[[int], None]) -> None:
     problem = make_problem(anchors=5 * CHUNK, visible=4 * CHUNK + 33, offsets=4)
-    previous = numba.get_num_threads()
     results = []
-    for threads in (1, 2):
-        numba.set_num_threads(threads)
+    for number in (1, 2):
+        threads(number)
         out, grads = problem.run(decode)
         results.append([*out, *(grad.clone() for grad in grads.values())])
-    numba.set_num_threads(previous)
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 

@@ -12,19 +12,11 @@ from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
 from chronoscene.errors import ConfigError
 from chronoscene.methods import build_config, load_spec
-from chronoscene.training import devices
 
 CONFIG = AnchorConfig(random_growth=False)
 
 
-@pytest.fixture(params=["compiled", "torch"])
-def code(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The code of a CPU, and that of a GPU."""
-    if request.param == "torch":
-        monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
-
-
-both_codes = pytest.mark.usefixtures("code")
+both_codes = pytest.mark.usefixtures("both_codes")
 
 
 def grown(

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import threading
 from typing import Any
 
 import numba
 import numpy as np
 import pytest
+from fresh_process import run_python
 
 from chronoscene.kernels.thread_pool import launch
 
 MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-
-
-@pytest.fixture
-def threads() -> Any:
-    before = numba.get_num_threads()
-    yield numba.set_num_threads
-    numba.set_num_threads(before)
 
 
 def test_every_job_is_done_once_and_waited_for(threads: Any) -> None:
@@ -75,4 +67,4 @@ if child == 0:
     os._exit(0 if seen[0] == 1 else 1)
 assert os.waitpid(child, 0)[1] == 0
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    run_python(code)

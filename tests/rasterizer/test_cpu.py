@@ -31,14 +31,6 @@ def assert_equal_bits(a: list[torch.Tensor], b: list[torch.Tensor]) -> None:
         assert torch.equal(x, y)
 
 
-@pytest.fixture
-def threads() -> Any:
-    before = numba.get_num_threads()
-    yield numba.set_num_threads
-    numba.set_num_threads(before)
-
-
-@pytest.mark.skipif(MAX_THREADS < 2, reason="needs two threads")
 @pytest.mark.parametrize(("count", "size"), [(3000, 150), (40, 20)])
 def test_bits_do_not_depend_on_the_number_of_threads(
     count: int, size: int, tools: SimpleNamespace, threads: Any
@@ -54,7 +46,6 @@ def test_bits_do_not_depend_on_the_number_of_threads(
         assert_equal_bits(results[0], other)
 
 
-@pytest.mark.skipif(MAX_THREADS < 2, reason="needs two threads")
 @pytest.mark.parametrize(("count", "size"), [(9_000, 70), (60_000, 96)])
 def test_workers_that_share_lists_wait_for_each_other(
     count: int, size: int, tools: SimpleNamespace, threads: Any

@@ -10,7 +10,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -35,7 +34,6 @@ BY_NAME = {extreme.name: extreme for extreme in EXTREMES}
 AGREEING = [e for e in EXTREMES if e.outcome == AGREES]
 CULLING = [e for e in EXTREMES if e.outcome == CULLED]
 REFUSED = [e for e in EXTREMES if e.outcome not in (AGREES, CULLED)]
-MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 
 
 LONG = ("1e5 on one pixel", "an image of 8191 x 1")
@@ -151,14 +149,6 @@ def test_the_check_lets_it_pass(extreme: Extreme) -> None:
     extreme.build().render("cpu", check_finite=True)
 
 
-@pytest.fixture
-def threads() -> Any:
-    before = numba.get_num_threads()
-    yield numba.set_num_threads
-    numba.set_num_threads(before)
-
-
-@pytest.mark.skipif(MAX_THREADS < 2, reason="needs two threads")
 @named([*AGREEING, *CULLING])
 def test_bits_do_not_depend_on_the_number_of_threads(extreme: Extreme, threads: Any) -> None:
     scene, results = extreme.build(), []

@@ -5,18 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from chronoscene.training import devices
 from chronoscene.training.losses import mean_volume, steady_mean
 
-
-@pytest.fixture(params=["compiled", "torch"])
-def code(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The code of a CPU, and that of a GPU."""
-    if request.param == "torch":
-        monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
-
-
-both_codes = pytest.mark.usefixtures("code")
+both_codes = pytest.mark.usefixtures("both_codes")
 
 
 def test_a_steady_mean_is_the_same_for_any_number_of_threads() -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 from chronoscene.errors import ShapeError
-from chronoscene.training import devices
 from chronoscene.training.photometric import photometric_loss, photometric_loss_reference, ssim_map
 
 # Worst of 600 random images up to 60x60 against float64: value 1e-8, gradient 8e-7.
@@ -26,14 +25,7 @@ FLAT_VALUE_TOLERANCE = 2e-4
 FLAT_GRADIENT_TOLERANCE = 2e-3
 
 
-@pytest.fixture(params=["compiled", "torch"])
-def code(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The code of a CPU, and that of a GPU."""
-    if request.param == "torch":
-        monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
-
-
-both_codes = pytest.mark.usefixtures("code")
+both_codes = pytest.mark.usefixtures("both_codes")
 
 
 def random_images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -209,16 +201,12 @@ def test_not_a_number_is_not_hidden() -> None:
     assert bool(photometric_loss(image, target).isnan())
 
 
-def test_same_bits_for_any_thread_count() -> None:
-    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
-        pytest.skip("one processor only")
+def test_same_bits_for_any_thread_count(threads: Callable[[int], None]) -> None:
     image, target = random_images(61, 47)
-    previous = numba.get_num_threads()
     results = []
-    for threads in (1, 2):
-        numba.set_num_threads(threads)
+    for number in (1, 2):
+        threads(number)
         results.append(value_and_gradient(photometric_loss, image, target, 0.2))
-    numba.set_num_threads(previous)
     assert torch.equal(results[0][0], results[1][0])
     assert torch.equal(results[0][1], results[1][1])
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numba
+from collections.abc import Callable
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -50,19 +51,15 @@ def test_equals_torch(
     torch.testing.assert_close(ours, theirs, atol=TOLERANCE, rtol=TOLERANCE)
 
 
-def test_large_array_equals_torch_and_any_thread_count() -> None:
+def test_large_array_equals_torch_and_any_thread_count(threads: Callable[[int], None]) -> None:
     results = []
-    for threads in (1, 2):
-        if threads > numba.config.NUMBA_NUM_THREADS:  # type: ignore[attr-defined]
-            pytest.skip("one processor only")
-        previous = numba.get_num_threads()
-        numba.set_num_threads(threads)
+    for number in (1, 2):
+        threads(number)
         value = leaf(3 * BLOCK + 77)
         adam = Adam({"x": value})
         for index in range(3):
             value.grad = gradient(value, index)
             adam.step({"x": 0.01})
-        numba.set_num_threads(previous)
         results.append(value.detach())
     assert torch.equal(results[0], results[1])
     reference = leaf(3 * BLOCK + 77)

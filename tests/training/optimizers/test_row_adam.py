@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numba
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -153,17 +154,14 @@ def test_tables_together_have_the_bits_of_each_alone() -> None:
         assert torch.equal(a.flush(), b.flush())
 
 
-def test_equal_bits_for_any_number_of_threads() -> None:
-    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
-        pytest.skip("one processor only")
-    previous, results = numba.get_num_threads(), []
-    for threads in (1, 2):
-        numba.set_num_threads(threads)
+def test_equal_bits_for_any_number_of_threads(threads: Callable[[int], None]) -> None:
+    results = []
+    for number in (1, 2):
+        threads(number)
         both = Both(5_000, 11, seed=0)
         for _ in range(6):
             both.step(0.4, 0.01)
         results.append(both.lazy.flush())
-    numba.set_num_threads(previous)
     assert torch.equal(*results)
 
 
