@@ -2,20 +2,17 @@
 
 import subprocess
 import sys
+from functools import partial
 from importlib.machinery import ModuleSpec
 from importlib.metadata import metadata
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke
 
 from chronoscene import __version__
-from chronoscene.cli import cli, doctor
+from chronoscene.cli import doctor
 
-
-def run():
-    result = CliRunner().invoke(cli, ["doctor"])
-    assert not result.exception or isinstance(result.exception, SystemExit)
-    return result
+run = partial(invoke, "doctor")
 
 
 def rows(text):

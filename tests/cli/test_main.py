@@ -9,15 +9,16 @@ import time
 
 import click
 import pytest
-from click.testing import CliRunner
+from command_line import invoke, refused, run_command
+from fresh_process import loaded_by, run_python
 
 import chronoscene.cli as cli_package
-from chronoscene.cli import COMMANDS, SECTIONS, cli, main
+from chronoscene.cli import COMMANDS, SECTIONS, cli
 from chronoscene.errors import SceneError
 
 
 def test_help_lists_every_command():
-    result = CliRunner().invoke(cli, ["--help"])
+    result = invoke("--help")
     assert result.exit_code == 0
     for name in COMMANDS:
         assert f"\n  {name} " in result.output
@@ -38,35 +39,27 @@ def test_the_package_can_be_run():
 
 
 def test_unknown_command_is_a_usage_error():
-    result = CliRunner().invoke(cli, ["frobnicate"])
+    result = invoke("frobnicate")
     assert result.exit_code == 2
     assert "No such command" in result.output
 
 
-def test_our_errors_become_one_line_and_status_2(monkeypatch, capsys):
+def test_our_errors_become_one_line_and_status_2(monkeypatch):
     @click.command("boom")
     def boom() -> None:
         raise SceneError("scene", expected="a model", found="nothing", todo="add one")
 
     monkeypatch.setattr(cli_package.cli, "get_command", lambda ctx, name: boom)
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "boom"])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    assert capsys.readouterr().err == "error: scene: expected a model, found nothing; add one\n"
+    assert refused("boom") == "error: scene: expected a model, found nothing; add one\n"
 
 
-def test_a_full_disk_is_one_line_too(monkeypatch, capsys):
+def test_a_full_disk_is_one_line_too(monkeypatch):
     @click.command("boom")
     def boom() -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "runs/results.json")
 
     monkeypatch.setattr(cli_package.cli, "get_command", lambda ctx, name: boom)
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "boom"])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    told = capsys.readouterr().err
+    told = refused("boom")
     assert told.startswith("error: runs/results.json: expected space for what is written there, ")
     assert "found No space left on device; free space" in told
     assert told.count("\n") == 1
@@ -120,35 +113,23 @@ scene, out = sys.argv[1:]
 for words in (["validate", scene], ["stats", scene], ["convert", scene, out]):
     cli.main(words, standalone_mode=False)
 """
-    command = [sys.executable, "-c", code, str(scene), str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    run_python(code, scene, tmp_path / "out")
     assert (tmp_path / "out/sparse/split.txt").is_file()
 
 
 def test_help_imports_nothing_heavy():
-    code = (
-        "import sys; from chronoscene.cli import cli\n"
-        "try: cli.main(['--version'])\n"
-        "except SystemExit: pass\n"
-        "heavy = {'torch', 'numba', 'cv2', 'pandas', 'pycolmap'} & set(sys.modules)\n"
-        "assert not heavy, heavy"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    code = "from chronoscene.cli import cli\ntry: cli.main(['--version'])\nexcept SystemExit: pass"
+    assert not loaded_by(code) & {"torch", "numba", "cv2", "pandas", "pycolmap"}
 
 
-def test_an_interruption_does_not_exit_like_a_failure(monkeypatch, capsys):
+def test_an_interruption_does_not_exit_like_a_failure(monkeypatch):
     @click.command("stopped")
     def stopped() -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli_package.cli, "get_command", lambda ctx, name: stopped)
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "stopped"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 130
-    assert "interrupted" in capsys.readouterr().err
+    done = run_command("stopped")
+    assert done.exit_code == 130 and "interrupted" in done.stderr
 
 
 @pytest.mark.parametrize(("status", "code"), [(0, 0), (1, 1)])
@@ -159,7 +140,4 @@ def test_a_verdict_sets_the_exit_status(monkeypatch, status, code):
         context.exit(status)
 
     monkeypatch.setattr(cli_package.cli, "get_command", lambda ctx, name: judged)
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "judged"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == code
+    assert run_command("judged").exit_code == code

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command_line import invoke
 from PIL import Image
 
 from chronoscene.cli import cli
@@ -107,8 +108,7 @@ def test_a_table(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(results, "read_runs", lambda folders: ([], []))
     monkeypatch.setattr(results, "format_runs", lambda *_, **__: "no runs\n")
     with pytest.raises(ConfigError, match=r"^--out .*file/t\.csv: expected a file that can be"):
-        arguments = ["table", str(places), "--out", str(places / "file/t.csv")]
-        CliRunner().invoke(cli, arguments, catch_exceptions=False)
+        invoke("table", places, "--out", places / "file/t.csv")
 
 
 def test_what_is_no_error_of_the_disk_passes() -> None:

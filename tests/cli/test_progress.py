@@ -12,9 +12,9 @@ from types import SimpleNamespace
 
 import pytest
 import rich.console
-from click.testing import CliRunner
+from command_line import invoke
 
-from chronoscene.cli import cli, progress
+from chronoscene.cli import progress
 from chronoscene.cli.progress import format_rate, progress_bar, tracked
 
 
@@ -139,7 +139,7 @@ def test_without_a_terminal_commands_say_what_they_begin(
     make_scene_folder: Callable[[], Path], tmp_path: Path, words: str, begins: list[str]
 ) -> None:
     places = {"scene": make_scene_folder(), "out": tmp_path / "out"}
-    done = CliRunner().invoke(cli, words.format(**places).split(), catch_exceptions=False)
+    done = invoke(*words.format(**places).split())
     lines = done.stderr.splitlines()
     expected = [line.format(**places) for line in begins]
     assert [line for line in lines if line in expected] == expected
@@ -198,6 +198,5 @@ def test_commands_tell_their_progress(
     terminal = SimpleNamespace(stderr=SimpleNamespace(isatty=lambda: True))
     monkeypatch.setattr(progress, "sys", terminal)
     monkeypatch.setattr(progress, "_bar", bar)
-    arguments = words.format(scene=make_scene_folder(), out=tmp_path / "out").split()
-    done = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    done = invoke(*words.format(scene=make_scene_folder(), out=tmp_path / "out").split())
     assert done.exit_code in (0, 1) and news in told

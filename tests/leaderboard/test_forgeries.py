@@ -12,9 +12,8 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import succeed
 
-from chronoscene.cli import cli
 from chronoscene.harness.files.predictions import (
     encode_png,
     load_image,
@@ -393,9 +392,7 @@ def test_the_site_is_built_whatever_lies_among_the_entries(honest, forger, place
     (place / "loop").symlink_to(place)
     os.mkfifo(place / "pipe.json")
     site = place.with_name("site")
-    arguments = ["leaderboard", place, "--verify", honest / "yard", "--out", site]
-    done = CliRunner().invoke(cli, [*map(str, arguments)], catch_exceptions=False)
-    assert done.exit_code == 0
+    done = succeed("leaderboard", place, "--verify", honest / "yard", "--out", site)
     assert done.stdout.startswith("measured entries: 2; verified: 1; claimed: 1;")
     assert f"claimed: 1: {NO_IMAGES}\n" in done.stdout
     assert done.stderr.count("left out: ") == 6

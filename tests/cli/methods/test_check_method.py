@@ -5,16 +5,11 @@ import subprocess
 import sys
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke
 
-from chronoscene.cli import cli
 from chronoscene.cli.methods.check_method import SKELETON
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.harness.contract import RuleResult
-
-
-def run(*arguments):
-    return CliRunner().invoke(cli, [*map(str, arguments)], catch_exceptions=False)
 
 
 def texts(folder):
@@ -24,9 +19,9 @@ def texts(folder):
 
 
 def test_a_new_method_is_the_example_with_another_name(tmp_path):
-    assert run("new-method", "tinted-gaussians", "--out", tmp_path / "same").exit_code == 0
+    assert invoke("new-method", "tinted-gaussians", "--out", tmp_path / "same").exit_code == 0
     assert texts(tmp_path / "same") == texts(SKELETON)
-    result = run("new-method", "my-own-idea", "--out", tmp_path / "new")
+    result = invoke("new-method", "my-own-idea", "--out", tmp_path / "new")
     assert "chronoscene check-method my-own-idea\n" in result.stdout
     new = texts(tmp_path / "new")
     assert sorted(new) == [
@@ -39,21 +34,21 @@ def test_a_new_method_is_the_example_with_another_name(tmp_path):
 
 
 def test_the_command_to_install_names_a_folder_with_blanks_as_a_shell_takes_it(tmp_path):
-    result = run("new-method", "mine", "--out", tmp_path / "a b")
+    result = invoke("new-method", "mine", "--out", tmp_path / "a b")
     assert f"pip install --editable '{tmp_path}/a b'\n" in result.stdout
 
 
 def test_wrong_names_and_places_are_refused(tmp_path):
     for name in ("My-Method", "3dgs", "a_b", "a-"):
         with pytest.raises(ConfigError, match="a small letter, then small letters and digits"):
-            run("new-method", name, "--out", tmp_path / "new")
+            invoke("new-method", name, "--out", tmp_path / "new")
     for name in ("class", "torch", "chronogs"):
         with pytest.raises(ConfigError, match=f"'{name}', which the package would hide"):
-            run("new-method", name, "--out", tmp_path / "new")
+            invoke("new-method", name, "--out", tmp_path / "new")
     (tmp_path / "used").mkdir()
     (tmp_path / "used/file").touch()
     with pytest.raises(SceneError, match="new or empty folder"):
-        run("new-method", "mine", "--out", tmp_path / "used")
+        invoke("new-method", "mine", "--out", tmp_path / "used")
 
 
 def test_the_example_is_short_installs_and_is_found(tmp_path):
@@ -61,7 +56,7 @@ def test_the_example_is_short_installs_and_is_found(tmp_path):
     assert not SKELETON.is_symlink()  # some checkouts have a file in the place of a link
     assert sum(len(p.read_text().splitlines()) for p in SKELETON.rglob("*.py")) < 100
     package = tmp_path / "package"  # pip leaves files beside what it builds
-    assert run("new-method", "tinted-gaussians", "--out", package).exit_code == 0
+    assert invoke("new-method", "tinted-gaussians", "--out", package).exit_code == 0
     options = ["--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--quiet"]
     site = tmp_path / "site"
     command = [sys.executable, "-m", "pip", "install", *options, "--target", site, package]
@@ -84,7 +79,7 @@ def test_rules_are_told_line_by_line(monkeypatch):
         yield RuleResult("It saves", problem="save: expected two files, found one")
 
     monkeypatch.setattr("chronoscene.harness.contract.check_method", findings)
-    result = run("check-method", "mine")
+    result = invoke("check-method", "mine")
     assert result.exit_code == 1
     assert result.stdout.splitlines() == [
         "ok      It trains",

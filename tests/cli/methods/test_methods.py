@@ -4,19 +4,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke, succeed
 from installed import install
 
-from chronoscene.cli import cli
 from chronoscene.methods import load_spec, method_names, options_of
 
 PLUGINS = Path(__file__).parents[2] / "harness" / "plugins"
 
 
 def methods(*arguments):
-    result = CliRunner().invoke(cli, ["methods", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+    return succeed("methods", *arguments).stdout
 
 
 def test_the_list_has_every_method():
@@ -28,7 +25,7 @@ def test_a_broken_plug_in_is_named_below_the_others(tmp_path, monkeypatch):
     entries = {"broken": "needs_more:SPEC", "gone": "not.there:SPEC", "no-spec": "needs_none:SPEC"}
     modules = {"needs_more": "import torch_of_tomorrow", "needs_none": "SPEC = 1"}
     install(monkeypatch, tmp_path, modules, "chronoscene.methods", entries)
-    done = CliRunner().invoke(cli, ["methods"], catch_exceptions=False)
+    done = invoke("methods")
     assert done.exit_code == 0 and "chronogs" in done.stdout and "realtime4dgs" in done.stdout
     lines = done.stderr.splitlines()
     assert [line.split(":")[1] for line in lines] == [" method broken", " method gone", " no-spec"]

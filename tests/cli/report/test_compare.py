@@ -1,41 +1,27 @@
 """``chronoscene compare``: table, figures, page."""
 
 import csv
+from functools import partial
 from shutil import rmtree
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import succeed
 from made_runs import scored, write_scored
 
-from chronoscene.cli import cli
 from chronoscene.errors import ChronoSceneError
-from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import ImageWriter, safe_name
-from chronoscene.harness.files.records import PREDICTIONS, Failure, write_failure, write_run
+from chronoscene.harness.files.records import PREDICTIONS, Failure, write_failure
 
 
 @pytest.fixture
 def runs(tmp_path):
     """One run of two test views in one period, without ``curve.csv``."""
-    runs = tmp_path / "runs"
-    run = scored(psnr=[[20.0, 10.0]])
-    folder = runs / "plaza/chronogs-joint-fast/seed0"
-    folder.mkdir(parents=True)
-    write_run(folder, run, run.rows)
-    for place in (ground_truth_folder(runs, "plaza"), folder / PREDICTIONS):
-        writer = ImageWriter(place)
-        for row in run.rows:
-            pixels = np.zeros((8, 12, 3), np.uint8)
-            writer.add(row.view, pixels, camera_period=0, rendered_period=0)
-        writer.close(kind="predictions", scene="plaza", scene_hash="s", details={})
-    return runs
+    write_scored(tmp_path / "runs", "chronogs", psnr=[[20.0, 10.0]])
+    return tmp_path / "runs"
 
 
-def compare(*arguments):
-    result = CliRunner().invoke(cli, ["compare", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result
+compare = partial(succeed, "compare")
 
 
 def test_the_worst_views_are_printed_and_figures_drawn(runs, tmp_path):

@@ -1,15 +1,10 @@
 """The commands of the leaderboard, from finished runs to a site."""
 
-from click.testing import CliRunner
+from command_line import invoke
 from made_runs import write_scored
 
-from chronoscene.cli import cli
 from chronoscene.harness.score.scoring import rescore
 from chronoscene.metrics.registry import make_scorers
-
-
-def invoke(*args):
-    return CliRunner().invoke(cli, [str(arg) for arg in args])
 
 
 def test_from_a_run_to_a_site(tmp_path):

@@ -5,18 +5,16 @@ import errno
 import io
 import json
 import os
-from pathlib import Path
 from shutil import copytree
 
 import pytest
-from click.testing import CliRunner
-from made_runs import write_scored
+from command_line import invoke, succeed
+from made_runs import record, write_scored
 
 import chronoscene.cli.report.results as results_module
-from chronoscene.cli import cli
 from chronoscene.cli.options import split_list
 from chronoscene.errors import CheckpointError, ConfigError, MetricUnavailableError
-from chronoscene.harness.files.records import RunRecord, read_run, run_folders, write_run
+from chronoscene.harness.files.records import read_run, run_folders, write_run
 from chronoscene.harness.score.scoring import Rescored
 from chronoscene.metrics.registry import Scorers
 
@@ -26,49 +24,21 @@ def runs(tmp_path):
     """Two seeds of one method, written by hand."""
     for seed in (0, 1):
         values = {"psnr": 20.0 + seed, "ssim": 0.5}
-        record = RunRecord(
-            method="m",
-            strategy="joint",
-            scene="plaza",
-            seed=seed,
+        run = record(
+            "m",
+            seed,
             aggregates={kind: dict(values) for kind in ("macro", "micro", "worst")},
             periods={"0": dict(values)},
-            seconds=1.0,
-            iterations=10,
-            primitives=3,
-            checkpoint_bytes=100,
-            peak_memory_bytes=10**8,
-            device="cpu",
-            commit="abc",
-            skipped={"lpips_vgg": "no weights"},
-            title="M",
-            preset="fast",
-            method_version="1",
-            config_hash="c",
-            scene_hash="s",
-            split_hash="p",
             period_labels={"0": "may"},
-            parameters=1,
-            warmup_seconds=0.0,
-            setup_seconds=0.0,
-            render_seconds=0.0,
-            peak_device_memory_bytes=None,
-            threads=1,
-            max_width=1600,
-            libraries={},
-            started="2026-01-01T00:00:00+00:00",
-            notices=[],
         )
         folder = tmp_path / "runs" / "plaza" / "m-joint-fast" / f"seed{seed}"
         folder.mkdir(parents=True)
-        write_run(folder, record, [])
+        write_run(folder, run, [])
     return tmp_path / "runs"
 
 
 def table(*arguments):
-    result = CliRunner().invoke(cli, ["table", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+    return succeed("table", *arguments).stdout
 
 
 def test_the_terminal_table(runs):
@@ -99,7 +69,7 @@ def test_files_are_written_whole(runs, tmp_path):
     assert table(runs, "--format", "csv", "--out", out) == ""
     lines = list(csv.DictReader(io.StringIO(out.read_text())))
     found = {(r["quantity"], r["column"]): float(r["mean"]) for r in lines}
-    assert found["psnr", "macro"] == 20.5 and found["iterations", ""] == 10
+    assert found["psnr", "macro"] == 20.5 and found["iterations", ""] == 100
     assert [p.name for p in out.parent.iterdir()] == ["table.csv"]
 
 
@@ -257,7 +227,7 @@ def test_wrong_input_is_told(runs, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(CheckpointError, match="run bench first"):
         table(tmp_path / "empty")
-    assert CliRunner().invoke(cli, ["table", str(runs), "--format", "html"]).exit_code == 2
+    assert invoke("table", runs, "--format", "html").exit_code == 2
 
 
 def test_lists():
@@ -278,7 +248,7 @@ def score(monkeypatch, tmp_path):
         monkeypatch.setattr(
             results_module, "rescore", lambda runs, scorers, progress: list(outcomes)
         )
-        return CliRunner().invoke(cli, ["score", str(tmp_path)], catch_exceptions=False)
+        return invoke("score", tmp_path)
 
     return run
 
@@ -301,9 +271,8 @@ def test_changes_are_told(score, tmp_path):
 
 
 def test_weights_that_no_metric_needs_are_refused(tmp_path):
-    command = ["score", str(tmp_path), "--metric", "psnr,flip", "--lpips-weights", str(tmp_path)]
     with pytest.raises(ConfigError, match="--lpips-weights: expected no such option without LPIPS"):
-        CliRunner().invoke(cli, command, catch_exceptions=False)
+        invoke("score", tmp_path, "--metric", "psnr,flip", "--lpips-weights", tmp_path)
 
 
 def test_a_run_that_cannot_be_scored_gives_status_1(score, tmp_path):
@@ -327,15 +296,14 @@ def test_runs_that_cannot_be_written_to_are_refused_before_scoring(score, monkey
 
 def test_a_folder_without_runs(tmp_path):
     with pytest.raises(CheckpointError, match="run bench first"):
-        CliRunner().invoke(cli, ["score", str(tmp_path)], catch_exceptions=False)
+        invoke("score", tmp_path)
 
 
 def test_weights_that_are_none(tmp_path):
     (tmp_path / "weights").mkdir()
-    arguments = ["score", str(tmp_path), "--lpips-weights", str(tmp_path / "weights")]
     with pytest.raises(MetricUnavailableError, match="expected VGG16 and the LPIPS heads"):
-        CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    missing = CliRunner().invoke(cli, [*arguments[:-1], str(Path(tmp_path) / "absent")])
+        invoke("score", tmp_path, "--lpips-weights", tmp_path / "weights")
+    missing = invoke("score", tmp_path, "--lpips-weights", tmp_path / "absent")
     assert missing.exit_code == 2 and "does not exist" in missing.output
 
 
@@ -345,6 +313,5 @@ def test_metrics_and_truth_are_passed_on(monkeypatch, tmp_path):
     monkeypatch.setattr(
         results_module, "rescore", lambda runs, scorers, progress: asked.append(scorers) or []
     )
-    arguments = ["score", str(tmp_path), "--metric", "ssim_cc,psnr", "--truth", str(tmp_path)]
-    assert CliRunner().invoke(cli, arguments, catch_exceptions=False).exit_code == 0
+    succeed("score", tmp_path, "--metric", "ssim_cc,psnr", "--truth", tmp_path)
     assert asked[0] == (tmp_path, tmp_path) and set(asked[1].functions) == {"psnr", "ssim_cc"}

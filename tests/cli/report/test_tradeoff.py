@@ -3,12 +3,12 @@
 import csv
 import io
 import json
+from functools import partial
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke
 from made_runs import record
 
-from chronoscene.cli import cli
 from chronoscene.cli.report.tradeoff import parse_size
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import write_run
@@ -35,8 +35,7 @@ def undrawn(monkeypatch):
     monkeypatch.setattr("chronoscene.cli.report.tradeoff.draw", lambda *arguments: None)
 
 
-def tradeoff(*arguments):
-    return CliRunner().invoke(cli, ["tradeoff", *map(str, arguments)], catch_exceptions=False)
+tradeoff = partial(invoke, "tradeoff")
 
 
 @pytest.mark.parametrize("style", FORMATS)

@@ -1,12 +1,12 @@
 """``chronoscene verify``: table, findings, exit status, entries of the leaderboard."""
 
 import json
+from functools import partial
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke
 from made_runs import write_scored
 
-from chronoscene.cli import cli
 from chronoscene.harness.files.provenance import config_hash
 from chronoscene.harness.files.records import CONFIG_FILE, read_run, write_run, write_summary
 from chronoscene.harness.score.scoring import rescore
@@ -33,8 +33,7 @@ def runs(tmp_path):
     return runs
 
 
-def verify(*arguments):
-    return CliRunner().invoke(cli, ["verify", *map(str, arguments)], catch_exceptions=False)
+verify = partial(invoke, "verify")
 
 
 def test_good_runs(runs):

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
-from command_line import run_command
+from command_line import invoke, run_command, succeed
 
 import chronoscene.cli.runs.bench as bench_module
 from chronoscene.cli import cli
@@ -121,12 +121,11 @@ def settings(monkeypatch):
     monkeypatch.setattr(bench_module, "run_bench", run_bench)
     monkeypatch.setattr(bench_module, "read_failures", lambda runs: [])
 
-    def invoke(*arguments):
-        result = CliRunner().invoke(cli, ["bench", *arguments], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
+    def settings_of(*arguments):
+        succeed("bench", *arguments)
         return seen[-1]
 
-    return invoke
+    return settings_of
 
 
 def test_scenes_in_folders_and_nearby(make_scene_folder, tmp_path, settings, monkeypatch):
@@ -243,11 +242,7 @@ def test_every_option_arrives(settings, tmp_path):
 )
 def test_wrong_options_are_told(make_scene_folder, arguments, message):
     with pytest.raises(ConfigError, match=message):
-        CliRunner().invoke(
-            cli,
-            ["bench", str(make_scene_folder()), "--method", "chronogs", *arguments],
-            catch_exceptions=False,
-        )
+        invoke("bench", make_scene_folder(), "--method", "chronogs", *arguments)
 
 
 def test_unknown_methods_name_the_known_ones(make_scene_folder):
@@ -263,7 +258,7 @@ def test_a_failed_bench_has_status_1(make_scene_folder, monkeypatch):
     )
     monkeypatch.setattr(bench_module, "run_bench", lambda *a: BenchOutcome((), 0, (failure,)))
     monkeypatch.setattr(bench_module, "read_failures", lambda runs: [failure])
-    result = CliRunner().invoke(cli, ["bench", str(make_scene_folder()), "--method", "m"])
+    result = invoke("bench", make_scene_folder(), "--method", "m")
     assert result.exit_code == 1
     assert "failed: s, m: because" in result.output
 

@@ -1,20 +1,19 @@
 """``chronoscene score-images`` on images that a script of ten lines writes."""
 
 import json
+from functools import partial
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke
 from PIL import Image
 
-from chronoscene.cli import cli
 from chronoscene.errors import ConfigError
 
 IMAGES = {f"{folder}/{i}.png": period for period, folder in enumerate("ab") for i in range(3)}
 TESTS = ["a/1.png", "b/1.png"]
 
 
-def run(*arguments):
-    return CliRunner().invoke(cli, ["score-images", *map(str, arguments)], catch_exceptions=False)
+run = partial(invoke, "score-images")
 
 
 def test_a_folder_of_images_gets_a_row(make_scene_folder, tmp_path):

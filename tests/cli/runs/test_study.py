@@ -3,9 +3,7 @@
 import json
 from types import SimpleNamespace
 
-from click.testing import CliRunner
-
-from chronoscene.cli import cli
+from command_line import invoke
 
 from .test_bench import IMAGES, TESTS, chronoscene
 
@@ -51,9 +49,8 @@ def test_budget_width_and_memory_are_options(make_scene_folder, tmp_path, monkey
     monkeypatch.setattr("chronoscene.cli.runs.study.run_study", run)
     (tmp_path / "rates.toml").write_text(STUDY)
     scene = make_scene_folder(IMAGES)
-    call = ("study", tmp_path / "rates.toml", scene, "--budget", "1m", "--max-width", 320)
-    call += "--photo-memory", 0.5
-    CliRunner().invoke(cli, [str(word) for word in call], catch_exceptions=False)
+    options = ("--budget", "1m", "--max-width", 320, "--photo-memory", 0.5)
+    invoke("study", tmp_path / "rates.toml", scene, *options)
     found = [(run.budget_seconds, run.max_width, run.photo_memory) for run in asked]
     assert found == [(60.0, 320, 500_000_000)]
 

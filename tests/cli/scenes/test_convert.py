@@ -2,15 +2,16 @@
 
 import csv
 import json
-import subprocess
-import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command_line import invoke, refused, succeed
+from fresh_process import loaded_by
 
-from chronoscene.cli import cli, main
+from chronoscene.cli import cli
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
@@ -20,12 +21,7 @@ from chronoscene.scene import WorldFrame
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.splits import split_hash
 
-
-def run(*arguments):
-    result = CliRunner().invoke(cli, ["convert", *map(str, arguments)])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
+run = partial(invoke, "convert")
 
 
 def test_says_what_was_converted(make_scene_folder, tmp_path):
@@ -169,14 +165,10 @@ def test_help_lists_formats_and_groupings():
         (["{scene}", "{tmp}/out", "--period-by", "year"], "--period-by: expected no such option"),
     ],
 )
-def test_errors_are_one_line(make_scene_folder, tmp_path, monkeypatch, capsys, arguments, message):
+def test_errors_are_one_line(make_scene_folder, tmp_path, arguments, message):
     scene = make_scene_folder()
     words = [a.format(tmp=tmp_path, scene=scene) for a in arguments]
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "convert", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
+    error = refused("convert", *words)
     assert message.format(scene=scene) in error.splitlines()[-1]
     assert error.count("\n") <= 2  # after "read SRC"
 
@@ -185,9 +177,7 @@ def test_dataset_commands_do_not_need_torch():
     names = ", ".join(
         f"chronoscene.cli.scenes.{name}" for name in ("convert", "split", "undistort")
     )
-    code = f"import sys, {names}; assert not {{'torch', 'pandas'}} & set(sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    assert not loaded_by(f"import {names}") & {"torch", "pandas"}
 
 
 def test_labels_that_the_output_cannot_encode(make_scene_folder, tmp_path):
@@ -212,6 +202,5 @@ def test_every_command_reads_colmap_projects_alike(make_scene_folder, tmp_path, 
     assert result.exit_code != 0
     assert "--period-by year, month or day" in f"{result.output}{result.exception}"
     rule = ["--dataset-format", "colmap-folders", "--period-by", f"table:{table}"]
-    result = CliRunner().invoke(cli, [command, str(folder), *out, *rule])
-    assert result.exit_code == 0, result.output
+    result = succeed(command, folder, *out, *rule)
     assert "the model is read from colmap/sparse/0, the images from images" in result.output

@@ -3,9 +3,11 @@
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from click.testing import CliRunner
+from command_line import invoke
 from hub_standin import serving
 
 from chronoscene.cli import cli
@@ -17,11 +19,7 @@ from chronoscene.metrics.lpips_weights import ENVIRONMENT
 CHRONOSCENE = DATASETS["chronoscene"]
 
 
-def run(*arguments):
-    result = CliRunner().invoke(cli, ["download", *map(str, arguments)])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
+run = partial(invoke, "download")
 
 
 @pytest.fixture
@@ -48,7 +46,7 @@ def test_downloads_a_scene_that_is_valid(hub, tmp_path):
     ]
     for step in ("list https://huggingface.co/datasets/", "MB downloaded", "files checked"):
         assert step in result.stderr
-    assert CliRunner().invoke(cli, ["validate", str(out)]).exit_code == 0
+    assert invoke("validate", out).exit_code == 0
 
 
 def test_default_folder_is_named_for_the_dataset(hub, tmp_path, monkeypatch):

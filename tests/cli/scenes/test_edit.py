@@ -1,22 +1,15 @@
 """``chronoscene edit`` and ``chronoscene triangulate`` on the command line."""
 
-import sys
-
 import pytest
-from click.testing import CliRunner
+from command_line import invoke, refused
 
-from chronoscene.cli import cli, main
 from chronoscene.formats import read_scene
-
-
-def run(*arguments):
-    return CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
 
 
 def test_says_what_is_left(make_scene_folder, tmp_path):
     periods = {f"{p}/{i}.png": j for j, p in enumerate("ab") for i in range(3)}
     folder = make_scene_folder(periods, tests=["a/0.png"])
-    result = run(
+    result = invoke(
         "edit", folder, tmp_path / "out", "--drop", "b/0.png", "--keep-period", "1",
         "--rename", "1=after", "--crop=-100,-100,-100,100,100,100", "--link", "hard",
     )  # fmt: skip
@@ -31,7 +24,7 @@ def test_says_what_is_left(make_scene_folder, tmp_path):
 
 def test_labels_that_are_numbers_stand_once(make_scene_folder, tmp_path):
     folder = make_scene_folder({f"{i}.png": i // 2 for i in range(4)}, tests=["0.png", "1.png"])
-    result = run("edit", folder, tmp_path / "out", "--drop", "3.png")
+    result = invoke("edit", folder, tmp_path / "out", "--drop", "3.png")
     assert "note: period 0 has no training images" in result.stderr
 
 
@@ -45,33 +38,23 @@ def test_labels_that_are_numbers_stand_once(make_scene_folder, tmp_path):
         (["--drop", "a/002.png"], "did you mean 'a/0002.png'?"),
     ],
 )
-def test_errors(make_scene_folder, tmp_path, monkeypatch, capsys, arguments, message):
-    words = ["chronoscene", "edit", str(make_scene_folder()), str(tmp_path / "out"), *arguments]
-    monkeypatch.setattr(sys, "argv", words)
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
+def test_errors(make_scene_folder, tmp_path, arguments, message):
+    error = refused("edit", make_scene_folder(), tmp_path / "out", *arguments)
+    assert message in error.splitlines()[-1]
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("command", [("edit", "--drop", "a/0001.png"), ("triangulate",)])
-def test_never_into_the_scene(make_scene_folder, monkeypatch, capsys, command):
+def test_never_into_the_scene(make_scene_folder, command):
     folder = make_scene_folder()
     name, *options = command
-    monkeypatch.setattr(sys, "argv", ["chronoscene", name, str(folder), f"{folder}/out", *options])
-    with pytest.raises(SystemExit):
-        main()
-    assert f"OUT {folder}/out: expected a place outside the scene" in capsys.readouterr().err
+    error = refused(name, folder, f"{folder}/out", *options)
+    assert f"OUT {folder}/out: expected a place outside the scene" in error
 
 
-def test_photos_without_common_features(make_scene_folder, tmp_path, monkeypatch, capsys):
-    words = ["triangulate", str(make_scene_folder()), str(tmp_path / "out"), "--threads", "1"]
-    monkeypatch.setattr(sys, "argv", ["chronoscene", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    lines = capsys.readouterr().err.splitlines()
+def test_photos_without_common_features(make_scene_folder, tmp_path):
+    error = refused("triangulate", make_scene_folder(), tmp_path / "out", "--threads", 1)
+    lines = error.splitlines()
     assert "at least 50 points, found 0: " in lines[-1] and "add images that overlap" in lines[-1]
     assert "was kept" in lines[-2]
     assert not (tmp_path / "out").exists()

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run_command
 from PIL import Image
-
-from tests.command_line import run_command
 
 
 @pytest.fixture

@@ -1,12 +1,11 @@
 """chronoscene split: files written, source left alone, errors."""
 
 import json
-import sys
+from functools import partial
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke, refused
 
-from chronoscene.cli import cli, main
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.scene.splits import split_hash
@@ -19,11 +18,7 @@ def scene(make_scene_folder):
     return make_scene_folder(PERIODS)
 
 
-def run(*arguments):
-    result = CliRunner().invoke(cli, ["split", *map(str, arguments)])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
+run = partial(invoke, "split")
 
 
 def snapshot(folder):
@@ -98,26 +93,19 @@ def test_whole_periods_are_remarked_upon(scene, tmp_path, period):
         (["{tmp}/nowhere", "{tmp}/o"], "expected a scene folder, found nothing"),
     ],
 )
-def test_errors(scene, tmp_path, monkeypatch, capsys, arguments, message):
+def test_errors(scene, tmp_path, arguments, message):
     (tmp_path / "there.txt").write_text("mine")
     (tmp_path / "other.json").write_text("mine")
     before = snapshot(tmp_path)
     words = [a.format(tmp=tmp_path, scene=scene) for a in arguments]
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "split", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
+    error = refused("split", *words)
     assert message.format(scene=scene) in error and "Traceback" not in error
     assert snapshot(tmp_path) == before
 
 
-def test_a_list_that_its_record_would_replace_is_refused(scene, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "split", str(scene), str(tmp_path / "a.json")])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    assert "expected a name for the list that does not end in .json" in capsys.readouterr().err
+def test_a_list_that_its_record_would_replace_is_refused(scene, tmp_path):
+    error = refused("split", scene, tmp_path / "a.json")
+    assert "expected a name for the list that does not end in .json" in error
     assert not (tmp_path / "a.json").exists()
 
 

@@ -6,13 +6,13 @@ import io
 import json
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
 from command_line import run_command
+from fresh_process import run_python
 
 from benchmarks.data.skeletons.dataset import write_skeleton
 from chronoscene.cli import cli
@@ -145,10 +145,7 @@ def test_torch_is_not_needed(make_scene_folder):
         "import sys; sys.modules.update(dict.fromkeys(('torch', 'numba', 'pandas')))\n"
         "from chronoscene.cli import main; main()"
     )
-    command = [sys.executable, "-c", code, "stats", str(make_scene_folder())]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert "Observations" in done.stdout
+    assert "Observations" in run_python(code, "stats", make_scene_folder())
 
 
 def test_several_scenes_are_read_in_several_processes(make_scene_folder, tmp_path):

@@ -5,16 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke
 
-from chronoscene.cli import cli
 from chronoscene.cli.scenes.synth import parse_size
 from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 from chronoscene.formats import chronoscene as scene_format
 
 
 def call(*args: str) -> object:
-    return CliRunner().invoke(cli, ["synth", *args], catch_exceptions=False).exit_code
+    return invoke("synth", *args).exit_code
 
 
 def test_makes_the_scene_that_the_options_ask_for(tmp_path: Path) -> None:
@@ -32,7 +31,7 @@ def test_makes_the_scene_that_the_options_ask_for(tmp_path: Path) -> None:
 def test_says_what_it_made(tmp_path: Path) -> None:
     out = tmp_path / "[bold] place"
     options = ["--preset", "tiny", "--periods", "1", "--size", "16x16", "--views", "4"]
-    result = CliRunner().invoke(cli, ["synth", str(out), *options], catch_exceptions=False)
+    result = invoke("synth", out, *options)
     assert result.stderr.splitlines()[-1] == f"{out}: 1 period, seed 0"
 
 

@@ -1,21 +1,15 @@
 """chronoscene undistort: the report, and errors on one line."""
 
 import re
-import sys
+from functools import partial
 
 import pytest
-from click.testing import CliRunner
+from command_line import invoke, refused
 
-from chronoscene.cli import cli, main
 from chronoscene.convert import convert
 from chronoscene.formats import read_scene
 
-
-def run(*arguments):
-    result = CliRunner().invoke(cli, ["undistort", *map(str, arguments)])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
+run = partial(invoke, "undistort")
 
 
 @pytest.fixture
@@ -72,13 +66,9 @@ def test_says_that_nothing_had_to_be_done(make_scene_folder, tmp_path):
         (["{scene}", "{tmp}"], "expected a new or empty folder"),
     ],
 )
-def test_errors_are_one_line(distorted, tmp_path, monkeypatch, capsys, arguments, message):
+def test_errors_are_one_line(distorted, tmp_path, arguments, message):
     words = [a.format(tmp=tmp_path, scene=distorted) for a in arguments]
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "undistort", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
+    error = refused("undistort", *words)
     assert message.format(scene=distorted) in error.splitlines()[-1]
     assert error.count("\n") <= 2  # after "read SCENE"
 

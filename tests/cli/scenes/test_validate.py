@@ -3,13 +3,13 @@
 import json
 import os
 import signal
-import sys
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from command_line import invoke, refused
 
-from chronoscene.cli import cli, main
+from chronoscene.cli import cli
 from chronoscene.cli.scenes.validate import _check
 from chronoscene.errors import ConfigError
 
@@ -18,9 +18,7 @@ PERIODS = {f"{'ab'[p]}{i}.png": p for p in (0, 1) for i in range(7)}
 
 def run(*arguments):
     """Exit status and standard output."""
-    result = CliRunner().invoke(cli, ["validate", *map(str, arguments)])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
+    result = invoke("validate", *arguments)
     return result.exit_code, result.stdout
 
 
@@ -155,16 +153,10 @@ def test_decode(good):
         (["{scene}", "--out", "{tmp}/absent/report"], "No such file or directory"),
     ],
 )
-def test_nothing_to_read_or_wrong_usage_is_status_2(
-    good, tmp_path, monkeypatch, capsys, arguments, message
-):
+def test_nothing_to_read_or_wrong_usage_is_status_2(good, tmp_path, arguments, message):
     (tmp_path / "empty").mkdir()
     words = [a.format(tmp=tmp_path, scene=good) for a in arguments]
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "validate", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
+    error = refused("validate", *words)
     assert message in error and error.count("\n") == 1
 
 
@@ -178,8 +170,7 @@ def test_names_that_the_output_cannot_encode(good, monkeypatch):
 
 def test_fix_reports_what_it_did_and_what_remains(warned, tmp_path):
     (warned / "images/a0.png").unlink()
-    arguments = ["validate", str(warned), "--fix", str(tmp_path / "fixed")]
-    result = CliRunner().invoke(cli, arguments)
+    result = invoke("validate", warned, "--fix", tmp_path / "fixed")
     assert result.exit_code == 1
     expected = "fixed: 2 corrections\n  also: 2 names in test.txt written in full\n  CS324: 1 line "
     assert expected in result.stderr
@@ -204,13 +195,9 @@ def test_no_copy_is_written_if_one_of_several_scenes_cannot_be(make_scene_folder
     assert not (tmp_path / "fixed").exists()
 
 
-def test_fix_into_the_scene_is_refused(good, monkeypatch, capsys):
-    arguments = ["chronoscene", "validate", str(good), "--fix", str(good / "fixed")]
-    monkeypatch.setattr(sys, "argv", arguments)
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    assert f"expected a place outside the scene, found one in {good}" in capsys.readouterr().err
+def test_fix_into_the_scene_is_refused(good):
+    error = refused("validate", good, "--fix", good / "fixed")
+    assert f"expected a place outside the scene, found one in {good}" in error
 
 
 def test_explain():
@@ -222,12 +209,8 @@ def test_explain():
     assert text.count("  to do: ") == 2
 
 
-def test_explain_nothing_that_is_there(capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["chronoscene", "validate", "--explain", "CS999"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    assert "--explain: expected rule codes" in capsys.readouterr().err
+def test_explain_nothing_that_is_there():
+    assert "--explain: expected rule codes" in refused("validate", "--explain", "CS999")
 
 
 @pytest.mark.parametrize("option", ["--out", "--sarif", "--html"])

@@ -4,13 +4,13 @@ import csv
 import io
 import re
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import invoke
 from PIL import Image
 
-from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.files.records import CHECKPOINT, read_with_rows, write_run
@@ -43,8 +43,7 @@ def scene(scene_folder, tmp_path):
     return root
 
 
-def compare(*arguments):
-    return CliRunner().invoke(cli, ["compare", *map(str, arguments)], catch_exceptions=False)
+compare = partial(invoke, "compare")
 
 
 def test_a_figure_and_the_scores(runs, scene):

@@ -3,14 +3,14 @@
 import csv
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import plyfile
 import pytest
-from click.testing import CliRunner
+from command_line import invoke
 from PIL import Image
 
-from chronoscene.cli import cli
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.harness.use.change_scores import changes_csv, changes_table, map_run
 from chronoscene.harness.use.changes import GEOMETRY, usual_pairs
@@ -98,8 +98,7 @@ def test_models_that_cannot_be_compared(run):
         next(map_run(flat, run.scene(), [(0, 1)]))
 
 
-def changes(*arguments):
-    return CliRunner().invoke(cli, ["changes", *map(str, arguments)], catch_exceptions=False)
+changes = partial(invoke, "changes")
 
 
 def test_the_command_writes_a_folder(run, scene, tmp_path):

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from command_line import invoke, succeed
 
 from chronoscene.cli import cli
 from chronoscene.compression.columns import Columns
@@ -28,9 +29,7 @@ from chronoscene.scene.scene import spread_frames
 
 def compress(folder, *options):
     """Compress a run; returns the folder of the new one, and what is printed."""
-    arguments = ["compress", str(folder), *options]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    result = succeed("compress", folder, *options)
     (out,) = {*run_folders(folder.parents[2])} - {folder}
     return out, result.stdout
 
@@ -109,7 +108,7 @@ def test_the_loss_is_that_of_the_file_though_a_position_is_far_away(tmp_path):
 
 def test_a_loss_beyond_all_images_is_a_usage_error():
     """Its share of errors is no number that a computer has."""
-    result = CliRunner().invoke(cli, ["compress", "run", "--max-loss", "1e300"])
+    result = invoke("compress", "run", "--max-loss", "1e300")
     assert result.exit_code == 2 and "1e+300 is not in the range 0<x<=100" in result.output
 
 

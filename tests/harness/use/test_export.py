@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
+from command_line import invoke, succeed
 from plyfile import PlyData
 
 from benchmarks.exports import plain_renderer, readers
-from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, ConfigError, DiskFullError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use import export as exporting
@@ -30,9 +29,7 @@ from chronoscene.training.spherical_harmonics import basis
 
 def export(folder, out, period, *options):
     """What the command prints: of the model and of the export, the PSNR on the test views."""
-    arguments = ["export", str(folder), "--period", str(period), "--out", str(out), *options]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    result = succeed("export", folder, "--period", period, "--out", out, *options)
     return [float(x) for x in re.findall(r"(-?[\d.]+) dB", result.stdout)]
 
 
@@ -172,8 +169,7 @@ def test_large_coordinates_lose_an_offset_that_is_written_down(trained, tmp_path
 
 def test_an_exposure_does_not_reach_the_background(trained, tmp_path):
     for method, said in (("3dgs-period", True), ("4dgs", False)):
-        arguments = ["export", str(trained[method]), "--period", "0", "--out"]
-        result = CliRunner().invoke(cli, [*arguments, str(tmp_path / "a.ply")])
+        result = invoke("export", trained[method], "--period", 0, "--out", tmp_path / "a.ply")
         assert ("a viewer lacks it where background shows\n" in result.stdout) == said
 
 
@@ -226,9 +222,8 @@ def test_no_space_leaves_nothing_behind(trained, tmp_path, monkeypatch):
 def test_an_earlier_stage_is_exported_from_the_views_that_it_saw(bench_here, tmp_path):
     outcome, _ = bench_here("chronogs", strategies=("sequential",), preset="fast", iterations=12)
     folder, out = outcome.finished[0], tmp_path / "stage.ply"
-    arguments = ["export", str(folder), "--period", "0", "--out", str(out), "--stage", "0"]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0 and len(read(out)[0]) > 0
+    succeed("export", folder, "--period", 0, "--out", out, "--stage", 0)
+    assert len(read(out)[0]) > 0
     run = open_run(folder, stage=0)
     scene = run.scene()
     own = [frame for frame in scene.frames if frame.period == 0]
@@ -237,8 +232,7 @@ def test_an_earlier_stage_is_exported_from_the_views_that_it_saw(bench_here, tmp
     whole = run.gaussians(0, scene=scene)
     np.testing.assert_array_equal(whole.sh_coeffs, alone.sh_coeffs)
     pictures = tmp_path / "pictures"
-    arguments = ["render", str(folder), "--period", "0", "--out", str(pictures), "--stage", "0"]
-    assert CliRunner().invoke(cli, arguments, catch_exceptions=False).exit_code == 0
+    succeed("render", folder, "--period", 0, "--out", pictures, "--stage", 0)
     assert len(list(pictures.rglob("*.png"))) == 3
 
 

@@ -3,14 +3,14 @@
 import csv
 import io
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import succeed
 from PIL import Image
 
-from chronoscene.cli import cli
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.files.records import ViewScore, read_rows
@@ -193,10 +193,7 @@ def truth(run, write_truth, tmp_path):
     return write_truth(run.scene(), tmp_path / "gt")
 
 
-def leakage(*arguments):
-    result = CliRunner().invoke(cli, ["leakage", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result
+leakage = partial(succeed, "leakage")
 
 
 def test_a_run_is_measured(run, truth):

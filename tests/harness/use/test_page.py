@@ -11,9 +11,8 @@ import subprocess
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import succeed
 
-from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, ConfigError, DiskFullError, SceneError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use import page_gaussians
@@ -35,9 +34,7 @@ LEAST_PSNR = 36.0
 
 
 def make_page(folders, out, *options):
-    arguments = ["page", *map(str, folders), "--out", str(out), *map(str, options)]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    result = succeed("page", *folders, "--out", out, *options)
     assert f"wrote {out / 'index.html'}" in result.stderr
     return result.stdout
 

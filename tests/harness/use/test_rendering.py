@@ -6,10 +6,9 @@ import os
 import av
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import succeed
 from PIL import Image
 
-from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, ConfigError, DiskFullError, SceneError
 from chronoscene.harness.files.predictions import load_image, read_manifest
 from chronoscene.harness.files.records import PREDICTIONS
@@ -19,9 +18,7 @@ TOY = ("--plugin", "toy_methods:MEAN")
 
 
 def render(folder, out, *options):
-    arguments = ["render", str(folder), "--out", str(out), *map(str, options)]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    result = succeed("render", folder, "--out", out, *options)
     assert f"wrote {out}" in result.stderr
 
 

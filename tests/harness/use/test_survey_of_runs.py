@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
+from command_line import succeed
 
 from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError
@@ -18,9 +19,7 @@ WORLD = WorldFrame("metre", "EPSG:32632", (680_000.0, 5_152_000.0, 0.0))
 def test_a_trained_run(trained, tmp_path, monkeypatch, method):
     read = TrainedRun.scene
     monkeypatch.setattr(TrainedRun, "scene", lambda *args: replace(read(*args), world=WORLD))
-    command = ["survey", str(trained[method]), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(cli, command)
-    assert result.exit_code == 0, result.output
+    succeed("survey", trained[method], "--out", tmp_path / "out")
     summary = json.loads((tmp_path / "out/survey.json").read_text())
     assert [period["label"] for period in summary["periods"]] == ["spring", "autumn"]
     assert summary["coordinates"]["crs"] == "EPSG:32632"

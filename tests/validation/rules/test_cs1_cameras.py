@@ -2,9 +2,8 @@ import struct
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import succeed
 
-from chronoscene.cli import cli
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import to_pycolmap
 from chronoscene.validation.rules.cs1_cameras import displacement
@@ -69,8 +68,7 @@ def test_undistorting_a_model_without_periods(scene, tmp_path):
     (finding,) = [f for f in scene.validate().findings if f.code == "CS133"]
     assert "chronoscene undistort DIR OUT" in finding.remedy and "table:FILE" in finding.remedy
     out = tmp_path / "out"
-    command = ["undistort", str(scene.root), str(out), "--period-by", f"table:{table}"]
-    assert CliRunner().invoke(cli, command).exit_code == 0
+    succeed("undistort", scene.root, out, "--period-by", f"table:{table}")
     assert not validate_scene(out).count("error")
 
 
