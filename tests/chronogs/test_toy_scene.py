@@ -18,6 +18,7 @@ from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.harness.train.checks import check_sharing
 from chronoscene.methods import TrainingSet, TrainingView
+from chronoscene.scene.geometry import look_at
 from chronoscene.scene.similarity import Sim3
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -30,14 +31,7 @@ Array = NDArray[np.float64]
 def camera(angle: float, radius: float, height: float) -> Array:
     """Pose that looks from a ring at a point above the middle. [4, 4]"""
     centre = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-    forward = np.array([0.0, 0.0, 0.15]) - centre
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ centre
-    return pose
+    return look_at(centre, np.array([0.0, 0.0, 0.15]))
 
 
 def paint(points: Array, tint: Array) -> Array:

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
 from benchmarks.registration.generated import pose_errors
+from chronoscene.arrays import Array
 from chronoscene.colmap.model import read_model
 from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.reconstruct.models import image_pose
 from chronoscene.scene import Scene
-from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
+from chronoscene.scene.geometry import camera_centre
 from chronoscene.synth import SynthSettings, generate
-
-Array = NDArray[np.float64]
 
 SETTINGS = SynthSettings(
     periods=2, width=400, height=300, views=12, points=1000, blocks=2, supersample=1
@@ -116,7 +116,7 @@ def make_case(tmp_path: Path) -> Callable[..., Case]:
         with pycolmap.Database.open(str(folder / "mapping.db")) as database:
             model = pycolmap.synthesize_dataset(options, database)
             periods = {str(i.name): int(i.camera_id) - 1 for i in model.images.values()}
-            truth = {str(i.name): pose_of(i) for i in model.images.values()}
+            truth = {str(i.name): image_pose(i) for i in model.images.values()}
             if moved:
                 move_points(model, database, moved)
             pycolmap.synthesize_noise(disturb, model, database)
@@ -128,11 +128,6 @@ def make_case(tmp_path: Path) -> Callable[..., Case]:
         return case
 
     return make
-
-
-def pose_of(image: pycolmap.Image) -> Array:
-    matrix = image.cam_from_world().matrix()
-    return pose_from_rotation_translation(matrix[:, :3], matrix[:, 3])
 
 
 def move_points(model: pycolmap.Reconstruction, database: pycolmap.Database, share: float) -> None:

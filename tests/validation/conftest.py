@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.colmap.model import read_reconstruction
-from chronoscene.scene.geometry import quaternion_from_rotation, rotation_from_quaternion
+from chronoscene.scene.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
 from chronoscene.validation.rule import SceneReport
 from chronoscene.validation.run import validate_scene
 
@@ -148,7 +148,10 @@ def good_scene(root: Path) -> None:
     (root / "images").mkdir()
     images = []
     for i, name in enumerate(PERIODS):
-        rotation, translation = look_at_origin(np.deg2rad(20 * i), 4.0 + 0.1 * i)
+        angle, distance = np.deg2rad(20 * i), 4.0 + 0.1 * i
+        centre = distance * np.array([np.cos(angle), 0.2, np.sin(angle)])
+        pose = look_at(centre, np.zeros(3), up=np.array([0.0, 1.0, 0.0]))
+        rotation, translation = pose[:3, :3], pose[:3, 3]
         uvw = (xyz @ rotation.T + translation) @ K.T
         xy = uvw[:, :2] / uvw[:, 2:]
         q = quaternion_from_rotation(rotation)
@@ -167,16 +170,6 @@ def good_scene(root: Path) -> None:
     }
     for place, lines in texts.items():
         (root / place).write_text("".join(f"{line}\n" for line in lines))
-
-
-def look_at_origin(angle: float, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """World-to-camera rotation and translation of a camera on a circle."""
-    centre = distance * np.array([np.cos(angle), 0.2, np.sin(angle)])
-    forward = -centre / np.linalg.norm(centre)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return rotation, -rotation @ centre
 
 
 def numbers(values: Iterable[float]) -> str:

@@ -1,6 +1,9 @@
-"""A clock that tests set."""
+"""A clock that tests set, and the training sets of the scene."""
 
 import pytest
+
+from chronoscene.harness.plan.parts import make_parts
+from chronoscene.images.store import ImageStore
 
 
 class FakeClock:
@@ -34,3 +37,10 @@ class FakeClock:
 @pytest.fixture
 def clock():
     return FakeClock()
+
+
+@pytest.fixture
+def part(make_scene):
+    """The part of strategy ``joint``."""
+    scene = make_scene()
+    return make_parts(scene, ImageStore(scene), "joint")[0]

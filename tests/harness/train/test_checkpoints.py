@@ -13,20 +13,12 @@ import torch
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files.records import CurvePoint
-from chronoscene.harness.plan.parts import make_parts
 from chronoscene.harness.plan.stop import StopRule
 from chronoscene.harness.train import checkpoints as module
 from chronoscene.harness.train.checkpoints import Checkpoints, LoopState
 from chronoscene.harness.train.loop import seed_everything, train
-from chronoscene.images.store import ImageStore
 from chronoscene.io.staging import needing_space
 from chronoscene.methods import import_object
-
-
-@pytest.fixture
-def part(make_scene):
-    scene = make_scene()
-    return make_parts(scene, ImageStore(scene), "joint")[0]
 
 
 def toy(name="Drawing", **options):

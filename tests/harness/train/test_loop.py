@@ -27,12 +27,6 @@ from chronoscene.methods import StepReport, import_object, load_spec
 from chronoscene.metrics.psnr_ssim import psnr
 
 
-@pytest.fixture
-def part(make_scene):
-    scene = make_scene()
-    return make_parts(scene, ImageStore(scene), "joint")[0]
-
-
 def toy(name="MeanColour", **options):
     config = import_object("toy_methods:Config")(**options)
     return import_object(f"toy_methods:{name}")(config)
