@@ -60,7 +60,9 @@ class DroneData:
 
 _DRONE = re.compile(rb"(?:drone(?:-\w+)?|Camera):\w")
 
-_UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # Millimetres in a unit of the focal plane's resolution
+_CENTIMETRE = 3
+_UNITS = {2: 25.4, _CENTIMETRE: 10.0, 4: 1.0}
+"""Millimetres in a unit of the focal plane's resolution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +121,25 @@ def exif_of(image: Image.Image) -> ExifData:
         if tags or "xmp" in image.info:
             return _parse(tags, _drone(image.info.get("xmp")))
     return ExifData()
+
+
+def lens_tags(exif: ExifData) -> Image.Exif:
+    """Return the tags of camera and focal length, for a copy of a photo in another format."""
+    per_cm = None if exif.focal_plane is None else 10 * exif.focal_plane
+    camera = {Base.Make: exif.make, Base.Model: exif.model}
+    lens = {
+        Base.FocalLength: exif.focal_mm,
+        Base.FocalLengthIn35mmFilm: exif.focal_35mm and round(exif.focal_35mm),
+        Base.FocalPlaneXResolution: per_cm,
+        Base.FocalPlaneYResolution: per_cm,
+        Base.FocalPlaneResolutionUnit: _CENTIMETRE,
+        Base.ExifImageWidth: exif.width,
+        Base.ExifImageHeight: exif.height,
+    }
+    tags = Image.Exif()
+    for directory, values in ((tags, camera), (tags.get_ifd(ExifTags.IFD.Exif), lens)):
+        directory.update({tag: value for tag, value in values.items() if value is not None})
+    return tags
 
 
 def taken_at(path: Path, exif: ExifData) -> datetime | None:

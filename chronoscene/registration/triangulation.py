@@ -111,7 +111,7 @@ def _place(scene: Scene, context: Context) -> dict[str, str]:
                 todo="fit cameras and images to each other first: chronoscene undistort",
             )
         target = context.photos / f"{i:06}{path.suffix.lower()}"
-        name = place_photo(path, target, read_exif(path).orientation).name
+        name = place_photo(path, target, read_exif(path)).name
         names[frame.name] = name
         if mask := scene.masks.get(frame.name):
             place_image(mask, context.work / mask_place(name), "symlink")

@@ -20,7 +20,7 @@ from PIL import Image
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.geodesy import Georeference
 from chronoscene.images.decoding import image_size, load_photo
-from chronoscene.images.exif import set_upright
+from chronoscene.images.exif import ExifData, lens_tags, set_upright
 from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.images.store import place_image
 from chronoscene.io.staging import replacing, sha256_of
@@ -358,7 +358,7 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
     names, turned, converted = [], 0, 0
     plain = plain_names([c.name for c in captures])
     for capture, name in zip(captures, plain, strict=True):
-        target = place_photo(capture.path, folder / name, capture.exif.orientation)
+        target = place_photo(capture.path, folder / name, capture.exif)
         converted += target != folder / name
         turned += target == folder / name and not target.is_symlink()
         names.append(target.relative_to(folder).as_posix())
@@ -372,8 +372,8 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
     return names, remarks
 
 
-def place_photo(path: Path, target: Path, orientation: int | None) -> Path:
-    """Place a photo where COLMAP reads the pixels that we do, in colour.
+def place_photo(path: Path, target: Path, exif: ExifData) -> Path:
+    """Place a photo where COLMAP reads the pixels that we do, in colour, and its focal length.
 
     Returns:
         ``target``, with another extension if the photo is converted. A link, where that will do.
@@ -385,8 +385,8 @@ def place_photo(path: Path, target: Path, orientation: int | None) -> Path:
         if mask is not None:
             image[~mask] = 0  # nothing is to be found in what is transparent
         with replacing(target) as partial:
-            Image.fromarray(image).save(partial, format="PNG")
-    elif orientation != 1 and path.suffix.lower() in (".jpg", ".jpeg"):
+            Image.fromarray(image).save(partial, format="PNG", exif=lens_tags(exif))
+    elif exif.orientation != 1 and path.suffix.lower() in (".jpg", ".jpeg"):
         data = path.read_bytes()
         with replacing(target) as partial:
             partial.write_bytes(set_upright(data) or data)

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,8 @@ from PIL import Image
 
 from chronoscene.geodesy import Georeference
 from chronoscene.images.decoding import load_rgb
+from chronoscene.images.exif import read_exif
+from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.photos import inputs
 from chronoscene.registration.photos.captures import Captures, read_captures
 from chronoscene.registration.photos.gps_priors import locate
@@ -74,6 +77,27 @@ def test_photos_that_colmap_does_not_read_become_png(folder: Path, tmp_path: Pat
     for capture, name in zip(captures, names, strict=True):
         placed = tmp_path / "photos" / name
         assert np.array_equal(load_rgb(placed), load_rgb(capture.path))
+
+
+def test_a_converted_photo_states_its_focal_length(folder: Path, tmp_path: Path) -> None:
+    """COLMAP would begin with that of a wide lens: 1.2 times the width."""
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0112] = "Maker", 6
+    exif.get_ifd(0x8769).update({0x920A: 8.8, 0xA405: 24, 0xA20E: 200.0, 0xA210: 3})
+    save(folder / "web.webp", 0, exif=exif)
+    captures = read_captures(folder).images
+    inputs.place_photos(captures, tmp_path / "photos")
+    placed = read_exif(tmp_path / "photos/web.webp.png")
+    assert placed == replace(captures[0].exif, orientation=1)
+    assert (placed.focal_mm, placed.focal_35mm, placed.focal_plane) == (8.8, 24, 20.0)
+    database = tmp_path / "database.db"
+    pycolmap.Database.open(database).close()
+    pycolmap.import_images(database, tmp_path / "photos", image_names=["web.webp.png"])
+    with pycolmap.Database.open(database) as opened:
+        (camera,) = opened.read_all_cameras()
+    diagonal = math.hypot(camera.width, camera.height)
+    assert camera.has_prior_focal_length
+    assert camera.mean_focal_length() == pytest.approx(24 / 43.27 * diagonal, rel=0.01)
 
 
 def test_the_size_of_a_turned_tiff_is_that_of_its_pixels(folder: Path) -> None:
