@@ -29,7 +29,7 @@ def check_step(report: StepReport, place: str) -> None:
     """Check the result of ``step``; the loss may be infinite or NaN."""
     _check_type(report, StepReport, place)
     _check_number(report.loss, Real, f"{place}: StepReport.loss", "a number")
-    _check_number(report.primitives, Integral, f"{place}: StepReport.primitives", "an integer")
+    _check_count(report.primitives, f"{place}: StepReport.primitives")
     _check_number(report.views, Integral, f"{place}: StepReport.views", "an integer")
     if report.views < 1:
         raise refuse(f"{place}: StepReport.views", "at least 1", report.views)
@@ -43,7 +43,7 @@ def check_size(size: MethodSize, place: str) -> None:
     """Check the result of ``size``."""
     _check_type(size, MethodSize, place)
     for name in ("primitives", "parameters"):
-        _check_number(getattr(size, name), Integral, f"{place}: MethodSize.{name}", "an integer")
+        _check_count(getattr(size, name), f"{place}: MethodSize.{name}")
 
 
 def check_sharing(sharing: PeriodSharing, size: MethodSize, place: str) -> None:
@@ -82,6 +82,12 @@ def check_prediction(prediction: Prediction, view: View, place: str) -> None:
 def _check_type(value: Any, wanted: type, place: str) -> None:
     if not isinstance(value, wanted):
         raise refuse(place, f"a {wanted.__name__}", type(value).__name__)
+
+
+def _check_count(value: Any, place: str) -> None:
+    _check_number(value, Integral, place, "an integer")
+    if value < 0:
+        raise refuse(place, "at least 0", value)
 
 
 def _check_number(value: Any, kind: type, place: str, wanted: str) -> None:

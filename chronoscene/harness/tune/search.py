@@ -294,7 +294,8 @@ def _finish(
     """
     from optuna.trial import TrialState
 
-    runs = [records.read_run(folder) for folder in finished]
+    folder = search.out / TRIALS / f"{trial.number:03d}"
+    runs = [records.read_run(run) for run in finished]
     value, ssim = (
         sum(run.aggregates["macro"].get(name, math.nan) for run in runs) / (len(runs) or math.nan)
         for name in ("psnr", "ssim")
@@ -314,12 +315,12 @@ def _finish(
         trial.set_user_attr(name, found)
     if reason:
         search.study.tell(trial, state=TrialState.FAIL)
-        log(f"trial {trial.number} failed: {reason}")
+        place = f", in {folder}" if folder.is_dir() else ""
+        log(f"trial {trial.number} failed: {reason}{place}")
     else:
         search.study.tell(trial, value)
         best = search.study.best_trial
         log(f"trial {trial.number}: {value:.3f} dB; best {best.value:.3f} dB ({best.number})")
-    folder = search.out / TRIALS / f"{trial.number:03d}"
     parts = (records.CHECKPOINT, records.PREDICTIONS, records.STAGES)
     bulky = [path for part in parts for path in folder.glob(f"*/*/seed*/{part}")]
     # Scenes may have the names of these two folders.

@@ -37,6 +37,8 @@ def test_what_is_right_passes():
         (check_step, StepReport(1.0, 1, views=0), "at: StepReport.views: expected at least 1, f"),
         (check_size, (1, 2), "at: expected a MethodSize, found tuple;"),
         (check_size, MethodSize(None, 2), "at: MethodSize.primitives: expected an integer, f"),
+        (check_step, StepReport(1.0, -1), "at: StepReport.primitives: expected at least 0, fou"),
+        (check_size, MethodSize(1, -2), "at: MethodSize.parameters: expected at least 0, found -2"),
         (check_size, MethodSize(1, 2.5), "at: MethodSize.parameters: expected an integer, f"),
     ],
 )

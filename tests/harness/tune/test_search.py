@@ -132,7 +132,7 @@ def test_the_first_trial_is_the_preset_and_the_best_one_becomes_a_preset(
     assert {"run.json", "results.json"} <= kept and not any("png" in name for name in kept)
 
 
-def test_failed_trials_count(search):
+def test_failed_trials_count(search, tmp_path, lines):
     def failing(job):
         return job.failure("too bad") if "001" in str(job.folder) else execute_here(job)
 
@@ -140,6 +140,7 @@ def test_failed_trials_count(search):
     assert [result.failure for result in results] == ["", "too bad", ""]
     assert results[1].psnr is None and results[1].ssim is None
     assert best_of(results) is not results[1]
+    assert f"trial 1 failed: too bad, in {tmp_path / 'out/trials/001'}" in lines
     assert search("out") == results
     with pytest.raises(ConfigError, match=r"expected a trial with a result, found none.*too bad"):
         search("none", 2, execute=lambda job: job.failure("too bad"))
