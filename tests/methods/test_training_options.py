@@ -26,7 +26,7 @@ OPTIONS = [
     ("3dgs", {"random_background": True}),
     ("3dgs", {"exposure": "image"}),
     ("3dgs", {"absgrad": True, "densify_interval": 8}),
-    ("scaffold-gs", {"absgrad": True, "density_interval": 8}),
+    ("scaffold-gs", {"absgrad": True, "density_interval": 8, "depth_weight": 0.0}),
     ("3dgs", {"antialiased": True}),
     ("scaffold-gs", {"antialiased": True}),
     ("scaffold-gs", {"random_background": True, "exposure": "image"}),
