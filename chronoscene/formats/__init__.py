@@ -223,8 +223,9 @@ def _match(path: Path, period_by: str | None) -> tuple[DetectedFormat | None, Fo
 
 def _has_marks(name: str, path: Path, model: FoundModel | None) -> bool:
     module = load_format(name)
+    arguments = (path, model) if hasattr(module, "assign") else (path,)
     with _of_package(name, path):
-        return bool(module.matches(path, *([model] if hasattr(module, "assign") else [])))
+        return bool(module.matches(*arguments))
 
 
 @contextmanager

@@ -43,7 +43,7 @@ def test_a_folder_of_runs_gives_an_entry_per_setting(make_run, enter, tmp_path):
 
 
 def test_options_with_several_values_are_entered(make_run, enter, tmp_path):
-    """As `as_typed` writes them."""
+    """`as_typed` writes them so."""
     variant = "offset_lr=[0.01, 1e-05],sh_degree=2"
     (path,) = enter([make_run(variant=variant)], tmp_path / "entries")
     assert read_entry(path).runs[0].record.variant == variant

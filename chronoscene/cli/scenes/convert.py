@@ -73,7 +73,8 @@ def command(
     if system is not None:
         frame = _local_frame(done.scene)
         write_coordinates(out, scene, frame, system)
-        notes += filter(None, [system.remark_on(frame)])
+        if remark := system.remark_on(frame):
+            notes.append(remark)
     lines = [f"{out}: {target} from {done.scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")

@@ -229,9 +229,11 @@ def summary(registered: Registered, out: Path, crs: str | None) -> str:
         again := same_positions(registered, registered.num_periods - 1)
     ):
         lines.append(f"note: {again[0]}" + (f" ({len(again)} like this)" if again[1:] else ""))
-    if crs is not None and registered.georeference is None:
-        lines.append(f"no coordinates in {crs}: neither GPS nor ground control places the model")
-    elif crs is not None and registered.georeference is not None:
-        remark = read_projected("--crs", crs).remark_on(registered.georeference)
-        lines += [] if remark is None else [f"note: {remark}"]
+    if crs is not None:
+        if registered.georeference is None:
+            lines.append(
+                f"no coordinates in {crs}: neither GPS nor ground control places the model"
+            )
+        elif remark := read_projected("--crs", crs).remark_on(registered.georeference):
+            lines.append(f"note: {remark}")
     return "\n".join(lines) + "\n"

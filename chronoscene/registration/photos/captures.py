@@ -134,7 +134,8 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
     if table is not None:
         return _assemble(path, _from_table(path, table))
     photos = photos_in(path)
-    unread = [*_unread(path, photos), *_broken_links(path)]
+    files = sorted(_files_in(path))
+    unread = [*_unread(path, files, photos), *_broken_links(path, files)]
     groups, left_out = _period_folders(path, photos)
     if groups:
         return _assemble(path, groups, left_out=[*left_out, *unread])
@@ -164,8 +165,12 @@ def _is_read(suffix: str) -> bool:
 
 
 def _files_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
-    """Yield the files below a folder, and links to none; ``above`` are the folders around it, to
-    which links may lead."""
+    """Yield the files below a folder, and broken links.
+
+    Args:
+        folder: Where to look.
+        above: Folders around it, to which links may lead.
+    """
     real = folder.resolve()
     if real in above or not real.is_dir():
         return
@@ -178,11 +183,11 @@ def _files_in(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
             yield path
 
 
-def _unread(root: Path, photos: Sequence[Path]) -> list[str]:
+def _unread(root: Path, files: Iterable[Path], photos: Sequence[Path]) -> list[str]:
     """Name photos in formats that are not read; nothing if there are none."""
     known = {p.with_suffix("") for p in photos}
-    files = (p for p in sorted(_files_in(root)) if p.with_suffix("") not in known)
-    found = [p for p in files if p.suffix.lower() in OTHERS]
+    others = (p for p in files if p.with_suffix("") not in known)
+    found = [p for p in others if p.suffix.lower() in OTHERS]
     if not found:
         return []
     suffixes = sorted({p.suffix.lower() for p in found})
@@ -194,10 +199,9 @@ def _unread(root: Path, photos: Sequence[Path]) -> list[str]:
     ]
 
 
-def _broken_links(root: Path) -> list[str]:
+def _broken_links(root: Path, files: Iterable[Path]) -> list[str]:
     """Name links to photos that are not there; nothing if there are none."""
-    links = (p for p in sorted(_files_in(root)) if not p.is_file())
-    found = [p for p in links if p.suffix.lower() in IMAGE_SUFFIXES]
+    found = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and not p.is_file()]
     if not found:
         return []
     return [

@@ -101,7 +101,7 @@ def test_a_converted_photo_states_its_focal_length(folder: Path, tmp_path: Path)
 
 
 def test_the_size_of_a_turned_tiff_is_that_of_its_pixels(folder: Path) -> None:
-    """By it, clicks are checked, calibrations scaled, and cameras told apart."""
+    """Clicks are checked by it, calibrations scaled, and cameras told apart."""
     exif = Image.Exif()
     exif[0x0112] = 6
     save(folder / "turned.tif", 0, exif=exif)
