@@ -12,6 +12,7 @@ everything done and passes through.
 
 from __future__ import annotations
 
+import atexit
 import os
 import threading
 from collections.abc import Callable
@@ -87,7 +88,6 @@ class _Task:
     args: tuple[Any, ...]
     workers: int
     taken: int = 1
-    caller_sleeps: bool = False
     error: BaseException | None = None
 
 
@@ -97,10 +97,11 @@ class _Pool:
     def __init__(self) -> None:
         self.busy = threading.Lock()  # one launch at a time
         self._mutex = threading.Lock()
-        self._finished = threading.Lock()
-        self._finished.acquire()
+        self._idle = threading.Condition(self._mutex)
         self._shared = np.zeros(16, np.int64)
         self._task: _Task | None = None
+        self._stopped = False
+        self._threads: list[threading.Thread] = []
         self._wake: list[threading.Lock] = []
         self._awake: list[bool] = []
 
@@ -110,54 +111,69 @@ class _Pool:
         with self._mutex:
             self._start_threads(workers - 1)
             self._task = task
-            self._shared[_GENERATION] += 1
-            for i in range(workers - 1):
-                if not self._awake[i]:
-                    self._awake[i] = True
-                    self._wake[i].release()
+            self._wake_threads(workers - 1)
         try:
             kernel(0, *args)
         finally:
-            self._close(task)
+            self._close()
         if task.error is not None:
             raise task.error
 
-    def _close(self, task: _Task) -> None:
+    def stop(self) -> None:
+        """End the threads, after what they are doing; later launches have one worker."""
+        with self._mutex:
+            self._stopped = True
+            self._wake_threads(len(self._threads))
+        for thread in self._threads:
+            thread.join()
+
+    def _close(self) -> None:
         """Let no other worker begin, and wait for those that have: they write to our arrays."""
         with self._mutex:
             self._task = None
-            active = int(self._shared[_ACTIVE])
-        while active > 0 and _wait_for_change(self._shared, _ACTIVE, active, _LOOKS):
-            active = int(self._shared[_ACTIVE])
-        with self._mutex:
-            task.caller_sleeps = bool(self._shared[_ACTIVE] > 0)
         interrupted = None
-        while task.caller_sleeps:
+        while True:
             try:
-                self._finished.acquire()
-                task.caller_sleeps = False
+                self._wait_until_idle()
+                break
             except KeyboardInterrupt as error:
                 interrupted = error
         if interrupted is not None:
             raise interrupted
 
+    def _wait_until_idle(self) -> None:
+        while (active := int(self._shared[_ACTIVE])) > 0:
+            if not _wait_for_change(self._shared, _ACTIVE, active, _LOOKS):
+                break
+        with self._idle:
+            while self._shared[_ACTIVE] > 0:
+                self._idle.wait()
+
     def _start_threads(self, count: int) -> None:
-        while len(self._wake) < count:
+        while len(self._threads) < count and not self._stopped:
             self._wake.append(threading.Lock())
             self._wake[-1].acquire()
             self._awake.append(False)
             name = f"kernels-{len(self._wake)}"
             args = (len(self._wake) - 1,)
-            threading.Thread(target=self._serve, args=args, name=name, daemon=True).start()
+            thread = threading.Thread(target=self._serve, args=args, name=name, daemon=True)
+            self._threads.append(thread)
+            thread.start()
+
+    def _wake_threads(self, count: int) -> None:
+        """Let the first threads look for what is new. The caller holds the mutex."""
+        self._shared[_GENERATION] += 1
+        for i in range(min(count, len(self._threads))):
+            if not self._awake[i]:
+                self._awake[i] = True
+                self._wake[i].release()
 
     def _serve(self, me: int) -> None:
         """Main loop of a worker thread."""
-        while True:
+        while not self._stopped:
             self._wake[me].acquire()
             while self._stay(me):
-                claim = self._claim()
-                if claim is not None:
-                    self._work(*claim)
+                self._work()
 
     def _stay(self, me: int) -> bool:
         """Wait a little for a task; False, with this thread marked as asleep, if there is none."""
@@ -166,34 +182,32 @@ class _Pool:
                 generation = int(self._shared[_GENERATION])
                 if self._task is not None and self._task.taken < self._task.workers:
                     return True
-                if last_look:
+                if last_look or self._stopped:
                     self._awake[me] = False
                     return False
             if _wait_for_change(self._shared, _GENERATION, generation, _LOOKS):
                 return True
         raise AssertionError
 
-    def _claim(self) -> tuple[_Task, int] | None:
-        """Claim a place in the present task; None if there is none."""
+    def _work(self) -> None:
+        """Take part in the present task, if it has a place."""
         with self._mutex:
             task = self._task
             if task is None or task.taken >= task.workers:
-                return None
+                return
             number = task.taken
             task.taken += 1
             self._shared[_ACTIVE] += 1
-            return task, number
-
-    def _work(self, task: _Task, number: int) -> None:
         try:
             task.kernel(number, *task.args)
         except BaseException as error:  # handed to the caller
             task.error = error
-        with self._mutex:
+        # The caller has it still, and frees its arrays: not this thread, at any later time.
+        del task
+        with self._idle:
             self._shared[_ACTIVE] -= 1
-            last = task.caller_sleeps and self._shared[_ACTIVE] == 0
-        if last:
-            self._finished.release()
+            if self._shared[_ACTIVE] == 0:
+                self._idle.notify()
 
 
 _pool = _Pool()
@@ -221,6 +235,17 @@ def use_pool(pool: _Pool) -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget)
+
+
+@atexit.register
+def _stop_all() -> None:
+    """End all threads before the interpreter goes.
+
+    It ends them while they wait for its lock, by unwinding their stacks; where these have frames of
+    C++ that allow no exceptions, the process aborts.
+    """
+    for pool in (_pool, *_spare):
+        pool.stop()
 
 
 def num_workers() -> int:

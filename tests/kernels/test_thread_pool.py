@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
+import time
+import weakref
 from typing import Any
 
 import numba
@@ -68,3 +71,62 @@ if child == 0:
 assert os.waitpid(child, 0)[1] == 0
 """
     run_python(code)
+
+
+def test_threads_end_before_the_interpreter_goes() -> None:
+    """A thread that waits for its lock then is unwound, which aborts where C++ frames forbid it."""
+    code = """
+import atexit, threading
+def check():
+    assert [thread.name for thread in threading.enumerate()] == ["MainThread"]
+    launch(kernel, 4, np.zeros(4))  # and whoever ends later can still launch
+    print("checked")
+atexit.register(check)  # callbacks run in the reverse order
+import numba, numpy as np
+from chronoscene.kernels.thread_pool import launch
+def kernel(worker, control, seen): seen[worker] += 1
+numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
+launch(kernel, 4, np.zeros(4))
+launch(kernel, 4, np.zeros(4))
+"""
+    assert "checked" in run_python(code)
+
+
+@pytest.mark.skipif(MAX_THREADS < 2, reason="needs two threads")
+def test_idle_threads_keep_no_arrays(threads: Any) -> None:
+    threads(2)
+    entered = threading.Event()
+
+    def kernel(worker: int, control: np.ndarray, array: np.ndarray) -> None:
+        if worker == 1:
+            entered.set()
+        assert entered.wait(30)
+
+    array = np.zeros(4)
+    alive = weakref.ref(array)
+    launch(kernel, 2, array)
+    del array
+    assert alive() is None
+
+
+@pytest.mark.skipif(MAX_THREADS < 2, reason="needs two threads")
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+def test_interruptions_wait_for_workers(threads: Any) -> None:
+    """Ctrl-C, twice, while a worker still writes: raised once it has ended."""
+    threads(2)
+    entered, ended = threading.Event(), threading.Event()
+
+    def kernel(worker: int, control: np.ndarray) -> None:
+        if worker == 1:
+            entered.set()
+            for _ in range(2):
+                time.sleep(0.2)
+                signal.raise_signal(signal.SIGINT)
+            time.sleep(0.2)
+            ended.set()
+        else:
+            assert entered.wait(30)
+
+    with pytest.raises(KeyboardInterrupt):
+        launch(kernel, 2)
+    assert ended.is_set()
