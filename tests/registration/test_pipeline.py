@@ -166,6 +166,9 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
     Image.fromarray(mask).save(tmp_path / f"masks/{masked}.png")
     run(read_captures(tmp_path / "first"), base, OPTIONS)
     old = read_scene(base)
+    webp = old.image_path(old.frames[-1])  # which COLMAP does not read
+    pixels = np.asarray(Image.open(webp))
+    Image.fromarray(pixels).save(webp, format="WEBP", lossless=True)
     out = tmp_path / "grown"
     registered = run(read_captures(captures / "2023"), out, OPTIONS, into=old)
     assert registered.route == "frozen"
@@ -177,7 +180,9 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
         assert same.cam_from_world.tobytes() == frame.cam_from_world.tobytes()
         assert same.camera == frame.camera
         assert (same.image_id, same.period, same.split) == (frame.image_id, 0, frame.split)
-        assert new.image_path(same).read_bytes() == old.image_path(frame).read_bytes()
+        if frame is not old.frames[-1]:
+            assert new.image_path(same).read_bytes() == old.image_path(frame).read_bytes()
+    assert (np.asarray(Image.open(new.image_path(same))) == pixels).all()
     assert list(old.masks) == list(new.masks) == [masked]
     assert new.masks[masked].read_bytes() == old.masks[masked].read_bytes()
     index = [f.name for f in old.frames].index(masked)

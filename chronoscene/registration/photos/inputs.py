@@ -246,7 +246,12 @@ def _place(
     for frame in scene.frames if scene else ():
         assert scene is not None
         _check_pinhole(scene, frame)
-        place_image(scene.image_path(frame), context.photos / frame.name, "symlink")
+        path, target = scene.image_path(frame), context.photos / frame.name
+        if _is_plain(path):
+            place_image(path, target, "symlink")
+        else:  # COLMAP and all that read the new scene go by the content, not by the extension
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _convert(path, target, ExifData())
         masks[frame.name] = scene.masks.get(frame.name)
     found = {name: mask for name, mask in masks.items() if mask is not None}
     for name, mask in found.items():
@@ -381,11 +386,7 @@ def place_photo(path: Path, target: Path, exif: ExifData) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     if not _is_plain(path):
         target = target.with_name(f"{target.name}.png")
-        image, mask = load_photo(path)
-        if mask is not None:
-            image[~mask] = 0  # nothing is to be found in what is transparent
-        with replacing(target) as partial:
-            Image.fromarray(image).save(partial, format="PNG", exif=lens_tags(exif))
+        _convert(path, target, exif)
     elif exif.orientation != 1 and path.suffix.lower() in (".jpg", ".jpeg"):
         data = path.read_bytes()
         with replacing(target) as partial:
@@ -393,6 +394,15 @@ def place_photo(path: Path, target: Path, exif: ExifData) -> Path:
     else:
         place_image(path, target, "symlink")
     return target
+
+
+def _convert(path: Path, target: Path, exif: ExifData) -> None:
+    """Write a photo as PNG, with the tags of its lens."""
+    image, mask = load_photo(path)
+    if mask is not None:
+        image[~mask] = 0  # nothing is to be found in what is transparent
+    with replacing(target) as partial:
+        Image.fromarray(image).save(partial, format="PNG", exif=lens_tags(exif))
 
 
 def plain_names(names: Sequence[str]) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from chronoscene.registration.photos.stated import contradicts
-from chronoscene.registration.quality.thresholds import Objection
+from chronoscene.registration.quality.thresholds import FLAT, TAKE_OFF, Objection
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
 
@@ -43,11 +43,8 @@ class Comparison:
 
 
 TODO = {
-    "focal length": "if the photos were not cropped and the zoom is as stated, add oblique photos, "
-    "or photos from a second height: photos of flat ground from one height do not determine it; "
-    "or give ground control: --tie-points with world coordinates",
-    "height above ground": "heights are those above the take-off point: if that lies on the ground "
-    "of the scene, give ground control: --tie-points with world coordinates",
+    "focal length": FLAT,
+    "height above ground": TAKE_OFF,
     "heading": "if the compass is reliable, register again without the photos whose GPS is off",
 }
 

@@ -40,6 +40,11 @@ _LOOK = (
 _RELIABLE = "if the GPS is reliable,"
 _CALIBRATE, _OBLIQUE = "calibrate each date (--calibration per-period)", "add oblique photos"
 _SAME_LENS = "if the lens and its focus were the same,"
+_FLAT = (
+    "if the photos were not cropped and the zoom is as stated, add oblique photos, or photos from "
+    "a second height: photos of flat ground from one height do not determine it; or"
+)
+_TAKE_OFF = "heights are those above the take-off point: if that lies on the ground of the scene,"
 _OTHER_LENS = "else calibrate it (--cameras), or photograph from the sides as well"
 
 CLICK = f"{_MARK} run again with --tie-points"
@@ -51,17 +56,21 @@ REPEAT = (
     "photograph again from where the photos of the other date were taken, in the same directions"
 )
 CONTROL = "give ground control: --tie-points with world coordinates"
+FLAT, TAKE_OFF = f"{_FLAT} {CONTROL}", f"{_TAKE_OFF} {CONTROL}"
 BEND = f"{_CALIBRATE}, or {_OBLIQUE}; otherwise {CONTROL}"
 SHARED = f"{_SAME_LENS} run again with --calibration shared; {_OTHER_LENS}"
 
 _TOGETHER = "register all dates together, without --into,"
 _CLICKED = f"{_MARK} {_TOGETHER} with --tie-points"
+_CONTROLLED = f"{_TOGETHER} with ground control: --tie-points with world coordinates"
 AFTER_INTO = {
     CLICK: _CLICKED,
     LOOK: f"{_LOOK} {_CLICKED}",
     OFFSET: f"{_RELIABLE} {_CLICKED}",
-    CONTROL: f"{_TOGETHER} with ground control: --tie-points with world coordinates",
-    BEND: f"{_OBLIQUE}, or {_TOGETHER} with ground control: --tie-points with world coordinates",
+    CONTROL: _CONTROLLED,
+    FLAT: f"{_FLAT} {_CONTROLLED}",
+    TAKE_OFF: f"{_TAKE_OFF} {_CONTROLLED}",
+    BEND: f"{_OBLIQUE}, or {_CONTROLLED}",
     SHARED: f"{_SAME_LENS} {_TOGETHER} with --calibration shared; {_OTHER_LENS}",
 }
 """Advice after ``--into``, which takes neither tie points nor another calibration, in place of the

@@ -15,6 +15,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from chronoscene.registration.quality import metadata
 from chronoscene.registration.quality.certificate import (
     Certificate,
     HeldOut,
@@ -631,9 +632,9 @@ def test_what_to_do_is_said_once_and_can_be_done() -> None:
     assert extended.endswith("register all dates together, without --into, with --tie-points")
 
 
-@pytest.mark.parametrize("check", THRESHOLDS)
-def test_no_advice_after_into_is_refused_with_into(check: str) -> None:
-    advice = AFTER_INTO.get(THRESHOLDS[check].todo, THRESHOLDS[check].todo)
+@pytest.mark.parametrize("usual", [*(t.todo for t in THRESHOLDS.values()), *metadata.TODO.values()])
+def test_no_advice_after_into_is_refused_with_into(usual: str) -> None:
+    advice = AFTER_INTO.get(usual, usual)
     refused = "--tie-points" in advice or "--calibration" in advice
     assert not refused or "without --into" in advice
 
