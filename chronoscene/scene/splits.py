@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -113,6 +114,14 @@ def _lines(text: str) -> Iterable[tuple[int, str]]:
     for number, line in enumerate(re.split("\r\n|\r|\n", text), start=1):
         if stripped := line.strip():
             yield number, stripped
+
+
+def composed(name: str) -> str:
+    """Return a name with accented letters as single characters, in which names are compared.
+
+    Files from macOS have them as a letter and an accent, which look the same.
+    """
+    return unicodedata.normalize("NFC", name)
 
 
 class NameIndex:

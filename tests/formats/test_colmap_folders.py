@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import unicodedata
 
 import pytest
 from hypothesis import given
@@ -63,6 +64,14 @@ def test_periods_from_a_table(colmap_folder, tmp_path):
     scene = read_scene(folder, format="colmap-folders", period_by=f"table:{table}")
     assert [f.period for f in scene.frames] == [1, 0, 0]
     assert [p.date for p in scene.periods] == ["2016", "2023"]
+
+
+def test_a_table_finds_names_in_another_unicode_form(colmap_folder, tmp_path):
+    names = [unicodedata.normalize("NFD", name) for name in ("pläne.png", "straße.png")]
+    folder, table = colmap_folder(names), tmp_path / "periods.csv"
+    table.write_text("file,period\npläne.png,2023\nstraße,2016\n", encoding="utf-8")
+    scene = read_scene(folder, format="colmap-folders", period_by=f"table:{table}")
+    assert {f.name: f.period for f in scene.frames} == dict(zip(names, (1, 0), strict=True))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.io.documents import read_text
 from chronoscene.io.wording import shown
 from chronoscene.scene import Period
-from chronoscene.scene.splits import NameIndex
+from chronoscene.scene.splits import NameIndex, composed
 
 Grouped = tuple[dict[str, int], tuple[Period, ...]]
 """Period of each image, and the periods."""
@@ -140,10 +140,11 @@ def group_by_table(names: Sequence[str], path: Path) -> Grouped:
     Raises:
         SceneError: If the file is damaged, or an image is missing or ambiguous in it.
     """
-    index = NameIndex(names)
+    whole = {composed(name): name for name in names}
+    index, respelt = NameIndex(names), NameIndex(whole)
     labels: dict[str, str] = {}
     for place, name, label in read_table(path):
-        found = index.find(name)
+        found = index.find(name) or [whole[key] for key in respelt.find(composed(name))]
         if len(found) > 1:
             several = f"{name!r}, which matches {shown(found)}"
             todo = "write the full names below images/"

@@ -25,7 +25,7 @@ from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.photo import Capture, open_photo
 from chronoscene.scene.grouping import grouped
-from chronoscene.scene.splits import IMAGE_SUFFIXES
+from chronoscene.scene.splits import IMAGE_SUFFIXES, composed
 
 PERIOD_GAP_DAYS = 14  # In one folder of photos, a gap of so many days begins a new period
 
@@ -249,15 +249,15 @@ def _from_table(root: Path, table: Path) -> list[_Listed]:
     """Read rows ``image, period`` of a CSV, in any order of columns."""
     listed: dict[str, _Listed] = {}
     for place, name, label in read_table(table, ("image", "file", "name")):
-        file = _in_root(root, name)
-        if not name or not label or file is None:
+        found = _in_root(root, name)
+        if not label or found is None:
             raise SceneError(
                 place,
                 expected="an image below the folder of the captures, and its period",
                 found=f"{name!r}, {label!r}",
                 todo="correct the line; paths are relative to the folder of the captures",
             )
-        name = PurePosixPath(name).as_posix()  # ./a.jpg and a.jpg are one photo
+        name, file = found  # ./a.jpg and a.jpg are one photo
         if name in listed and listed[name].label != label:
             raise SceneError(
                 place,
@@ -269,13 +269,32 @@ def _from_table(root: Path, table: Path) -> list[_Listed]:
     return list(listed.values())
 
 
-def _in_root(root: Path, name: str) -> Path | None:
-    """Find the file of a table entry in the folder or its ``images/``; None if it is outside."""
-    pure = PurePosixPath(name)
-    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
+def _in_root(root: Path, name: str) -> tuple[str, Path] | None:
+    """Find the name and file of a table entry in the folder or its ``images/``.
+
+    Returns:
+        None if it is outside. A missing file counts as one of the folder itself.
+    """
+    slashes = PurePosixPath(name.replace("\\", "/"))  # tables of Windows
+    if slashes.is_absolute() or ".." in slashes.parts or not slashes.parts:
         return None
-    inner = root / "images" / name
-    return inner if not (root / name).exists() and inner.exists() else root / name
+    for pure in (PurePosixPath(name), slashes):
+        for folder in (root, root / "images"):
+            path = _respelt(folder, pure)
+            if path.exists():
+                return path.relative_to(folder).as_posix(), path
+    return slashes.as_posix(), root / slashes
+
+
+def _respelt(folder: Path, name: PurePosixPath) -> Path:
+    """Return the path of a file whose accented letters may be in another form (`composed`)."""
+    for part in name.parts:
+        path = folder / part
+        if not part.isascii() and not path.exists() and folder.is_dir():
+            same = (p for p in folder.iterdir() if composed(p.name) == composed(part))
+            path = next(same, path)
+        folder = path
+    return folder
 
 
 def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str], list[str]]:

@@ -14,6 +14,7 @@ from chronoscene.errors import SceneError
 from chronoscene.io.documents import read_text
 from chronoscene.registration.photos.photo import Capture
 from chronoscene.scene.cameras import CAMERA_MODELS, Camera
+from chronoscene.scene.splits import composed
 
 _TODO = (
     "write lines such as: */cam1/*.jpg OPENCV 6012 4008 6621.7 6621.7 3013.2 1943.5 -0.09 0.08 0 0"
@@ -61,7 +62,9 @@ def known_groups(path: Path, captures: Sequence[Capture]) -> list[dict[str, Any]
     cameras = read_cameras(path)
     groups: dict[tuple[int, int, int], dict[str, Any]] = {}
     for capture in captures:
-        row = next((i for i, (p, _) in enumerate(cameras) if fnmatchcase(capture.name, p)), None)
+        name = composed(capture.name)
+        fits = (i for i, (p, _) in enumerate(cameras) if fnmatchcase(name, composed(p)))
+        row = next(fits, None)
         if row is None:
             raise SceneError(path, expected=f"a pattern that fits {capture.name}", found="none",
                              todo=_TODO)  # fmt: skip

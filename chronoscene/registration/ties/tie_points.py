@@ -23,6 +23,7 @@ from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.geodesy import Georeference, ReferenceSystem, read_reference_system
 from chronoscene.io.documents import read_text
+from chronoscene.scene.splits import composed
 
 COLUMNS = {
     "point": ("point", "point id", "point_id", "id", "name", "label"),
@@ -434,7 +435,11 @@ def _names_of(image: str, names: Sequence[str]) -> list[str]:
 
 def _ending(name: str, names: Sequence[str]) -> list[str]:
     """Return the name itself, if it is there, or those of which it is the end."""
-    return [name] if name in names else [n for n in names if n.endswith(f"/{name}")]
+    if name in names:
+        return [name]
+    plain = composed(name)
+    whole = [n for n in names if composed(n) == plain]
+    return whole or [n for n in names if composed(n).endswith(f"/{plain}")]
 
 
 def _todo(row: Sequence[str]) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import check_name
+from chronoscene.scene.splits import composed
 
 PUNCTUATION = "\"'`,;"  # What tables put around and after a name
 
@@ -23,7 +23,7 @@ def is_safe(name: str) -> bool:
 
 def spelling(name: str) -> str:
     """Return a key without case, spelling of accented letters in Unicode, and backslashes."""
-    return unicodedata.normalize("NFC", name).casefold().replace("\\", "/")
+    return composed(name).casefold().replace("\\", "/")
 
 
 class Spellings:

@@ -1,11 +1,13 @@
 """Two photos a date with known cameras, placed by control points: generated, with truth."""
 
 import json
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.io.pycolmap import pycolmap
@@ -164,6 +166,19 @@ def test_cameras_that_are_none_are_refused(line: str, tmp_path: Path) -> None:
     (tmp_path / "c.txt").write_text(line)
     with pytest.raises(SceneError, match=r"c\.txt"):
         read_cameras(tmp_path / "c.txt")
+
+
+def test_cameras_of_names_in_another_unicode_form(tmp_path: Path) -> None:
+    name = unicodedata.normalize("NFD", "Süd/ä.jpg")
+    (tmp_path / name).parent.mkdir()
+    Image.effect_noise((100, 80), 60).save(tmp_path / name)
+    (tmp_path / "c.txt").write_text("x/Süd/*.jpg PINHOLE 9 9 1 1 1 1\n", encoding="utf-8")
+    (photo,) = read_captures(tmp_path).images
+    with pytest.raises(SceneError, match="found none"):
+        known_groups(tmp_path / "c.txt", [photo])
+    (tmp_path / "c.txt").write_text("Süd/*.jpg PINHOLE 100 80 90 90 50 40\n", encoding="utf-8")
+    (group,) = known_groups(tmp_path / "c.txt", [photo])
+    assert group["names"] == [name]
 
 
 def test_cameras_are_scaled_and_must_fit(few: Few, tmp_path: Path, truth: Scene) -> None:

@@ -1,5 +1,6 @@
 """Finding photos, their periods, and reasons against some of them."""
 
+import unicodedata
 from datetime import datetime
 from pathlib import Path
 
@@ -221,6 +222,37 @@ def test_a_table_gives_periods(tmp_path: Path) -> None:
     table.write_text("file,period,lat\na.jpg,1,\nb c.jpg,0,\n")
     for captures in (read_captures(tmp_path, table=table), read_captures(table)):
         assert [(c.name, c.period) for c in captures.images] == [("a.jpg", 1), ("b c.jpg", 0)]
+
+
+@pytest.mark.parametrize("folder", ["", "images"])
+def test_a_table_may_have_names_in_another_unicode_form(tmp_path: Path, folder: str) -> None:
+    name = unicodedata.normalize("NFD", "Süd/höhe.jpg")
+    file = photo(tmp_path / folder / name)
+    photo(tmp_path / folder / "b.jpg")
+    table = tmp_path / "periods.csv"
+    table.write_text(
+        unicodedata.normalize("NFC", "image,period\nSüd/höhe.jpg,1\nb.jpg,0\n"), encoding="utf-8"
+    )
+    found = read_captures(table)
+    assert (found.images[0].name, found.images[0].path) == (name, file)
+    assert not found.refused
+    table.write_text(table.read_text(encoding="utf-8") + f"{name},2\n", encoding="utf-8")
+    with pytest.raises(SceneError, match="expected one period of 'Su"):
+        read_captures(table)
+
+
+def test_a_table_may_have_backslashes(tmp_path: Path) -> None:
+    names = ["a.jpg", "2016/b.jpg", "2016/x\\y.jpg"]
+    for name in names:
+        photo(tmp_path / name)
+    table = tmp_path / "periods.csv"
+    table.write_text("image,period\n.\\a.jpg,0\n2016\\b.jpg,0\n2016/x\\y.jpg,0\n2016\\c.jpg,0\n")
+    found = read_captures(table)
+    assert [c.name for c in found.images] == sorted(names)
+    assert [name for name, *_ in found.refused] == ["2016/c.jpg"]
+    table.write_text("image,period\n..\\a.jpg,0\n")
+    with pytest.raises(SceneError, match="below the folder of the captures"):
+        read_captures(table)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -238,6 +240,14 @@ def test_images_are_found_by_the_end_of_their_path(tmp_path: Path) -> None:
         by_photo(read(tmp_path, "p,b_c.jpg,1,2\n"), unread(names))
     with pytest.raises(SceneError, match=r"names of photos, such as 2016/a.jpg, found other.jpg"):
         by_photo(read(tmp_path, "p,other.jpg,1,2\n"), unread(names))
+
+
+def test_images_are_found_by_names_in_another_unicode_form(tmp_path: Path) -> None:
+    names = [unicodedata.normalize("NFD", n) for n in ("höhe.jpg", "Süd/höhe.jpg", "Süd/b ü.tif")]
+    text = unicodedata.normalize("NFC", "p,höhe.jpg,1,2\np,Süd/höhe.jpg,1,2\np,b ü.tif,1,2\n")
+    assert images(read(tmp_path, text), names) == names
+    new = [re.sub(r"\s", "_", names[2]) + ".png"]
+    assert images(read(tmp_path, text), new)[2:] == new
 
 
 def test_a_failed_alignment_is_replaced(tmp_path: Path, apart: Generated) -> None:

@@ -16,6 +16,7 @@ from chronoscene.io.staging import sha256_of
 from chronoscene.registration.features.given.colmap_database import ColmapDatabase
 from chronoscene.registration.features.given.hloc import HlocFile
 from chronoscene.registration.features.given.image_features import wrong
+from chronoscene.scene.splits import composed
 
 Kind = Literal["hloc", "COLMAP", "plug-in"]
 
@@ -112,12 +113,12 @@ def match_names(place: str, photos: Sequence[str], stored: Iterable[str]) -> dic
     """
     by_end: dict[str, list[str]] = {}
     for photo in photos:
-        parts = photo.split("/")
+        parts = composed(photo).split("/")
         for i in range(len(parts)):
             by_end.setdefault("/".join(parts[i:]), []).append(photo)
     found: dict[str, str] = {}
     for name in stored:
-        plain = re.sub(r"\s", "_", name)
+        plain = re.sub(r"\s", "_", composed(name))
         parts = plain.split("/")
         ends = ("/".join(parts[i:]) for i in range(len(parts)))
         fits = next((f for end in ends if (f := by_end.get(end) or by_end.get(f"{end}.png"))), [])

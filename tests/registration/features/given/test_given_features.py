@@ -2,6 +2,8 @@
 
 import hashlib
 import shutil
+import unicodedata
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +156,8 @@ def test_names_fit_by_their_end() -> None:
     photos = ["2016/a.jpg", "2016/b.tif.png", "2023/c_d.jpg"]
     found = match_names("f", photos, ["images/2016/a.jpg", "b.tif", "2023/c d.jpg", "z.jpg"])
     assert found == dict(zip(photos, ["images/2016/a.jpg", "b.tif", "2023/c d.jpg"], strict=True))
+    form = partial(unicodedata.normalize, "NFD")
+    assert match_names("f", [form("Süd/ä.jpg")], ["ä.jpg"]) == {form("Süd/ä.jpg"): "ä.jpg"}
     with pytest.raises(RegistrationError, match=r"fits 2016/a\.jpg and 2023/a\.jpg"):
         match_names("f", ["2016/a.jpg", "2023/a.jpg"], ["a.jpg"])
     with pytest.raises(RegistrationError, match="found none of them"):
