@@ -21,7 +21,7 @@ from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.images.decoding import HEIF_SUFFIXES, HEIF_TODO, reads_heif
 from chronoscene.images.exif import read_exif, taken_at
 from chronoscene.images.masks import MASKS, mask_place
-from chronoscene.io.wording import counted
+from chronoscene.io.wording import counted, printable
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.photo import Capture, open_photo
 from chronoscene.scene.grouping import grouped
@@ -194,7 +194,7 @@ def _unread(root: Path, files: Iterable[Path], photos: Sequence[Path]) -> list[s
     with_package = not reads_heif() and not set(HEIF_SUFFIXES).isdisjoint(suffixes)
     return [
         f"{counted(len(found), 'photo')} in formats that are not read ({', '.join(suffixes)}), "
-        f"such as {found[0].relative_to(root)}; they are left out; "
+        f"such as {printable(str(found[0].relative_to(root)))}; they are left out; "
         + (HEIF_TODO if with_package else "convert them to JPEG")
     ]
 
@@ -206,7 +206,8 @@ def _broken_links(root: Path, files: Iterable[Path]) -> list[str]:
         return []
     return [
         f"{counted(len(found), 'link')} to photos that are missing, such as "
-        f"{found[0].relative_to(root)}; they are left out; copy the photos, or connect their disk"
+        f"{printable(str(found[0].relative_to(root)))}; they are left out; copy the photos, or "
+        "connect their disk"
     ]
 
 
@@ -237,7 +238,8 @@ def _left_out(photos: Sequence[Path], why: str) -> list[str]:
     """Name photos without a period; nothing if there are none."""
     if not photos:
         return []
-    names = ", ".join(p.name for p in photos[:3]) + (", ..." if len(photos) > 3 else "")
+    names = ", ".join(printable(p.name) for p in photos[:3])
+    names += ", ..." if len(photos) > 3 else ""
     return [
         f"photos that {why}, so their period is unknown: {len(photos)} ({names}); they are left "
         "out; move them to the folder of their period, or give a table of images and periods "
@@ -346,6 +348,7 @@ def _assemble(
             todo = f"take frames from them, two a second: ffmpeg -i {name} -r 2 -q:v 2 %04d.jpg"
             raise _nothing(root, f"{counted(len(videos), 'video')}, and no image files", todo)
         raise _nothing(root, left_out[0] if left_out else "no image files")
+    _check_names(root, [item.name for item in listed])
     order = _ordered_labels(listed)
     images, refused = [], []
     numbers = [order.index(item.label) for item in listed]
@@ -371,7 +374,6 @@ def _assemble(
         CapturePeriod(label, period_date(label, {day for _, day in set(mine) - set(others)}))
         for label, mine, others in zip(order, dated, wrong, strict=True)
     )
-    _check_names(root, images)
     shown = ", ".join(f"{i} = {p.label} ({p.date or 'no date'})" for i, p in enumerate(periods))
     misdated = tuple(
         f"period {label}: {len(others)} of {len(mine)} photos have another date (EXIF, or file "
@@ -498,16 +500,16 @@ def period_date(label: str, dates: Iterable[date]) -> str | None:
     return str(first.year) if first.year == last.year else str(days[len(days) // 2].year)
 
 
-def _check_names(root: Path, images: Sequence[Capture]) -> None:
+def _check_names(root: Path, names: Iterable[str]) -> None:
     """Refuse names that a line of split.txt cannot represent."""
-    for capture in images:
-        if capture.name != capture.name.strip() or re.search(r"[\r\n]", capture.name):
-            raise SceneError(
-                root,
-                expected="image names without line breaks and without leading or trailing blanks",
-                found=repr(capture.name),
-                todo="rename the image",
-            )
+    for name in names:
+        expected = ""
+        if name != name.strip() or re.search(r"[\r\n]", name):
+            expected = "image names without line breaks and without leading or trailing blanks"
+        elif re.search(r"[\ud800-\udfff]", name):  # how Python shows bytes that are no text
+            expected = "image names in UTF-8"
+        if expected:
+            raise SceneError(root, expected=expected, found=repr(name), todo="rename the image")
 
 
 def _nothing(path: Path, found: str, todo: str = "copy the photos there") -> SceneError:

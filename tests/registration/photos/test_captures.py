@@ -1,5 +1,7 @@
 """Finding photos, their periods, and reasons against some of them."""
 
+import os
+import re
 import unicodedata
 from datetime import datetime
 from pathlib import Path
@@ -239,6 +241,22 @@ def test_a_table_may_have_names_in_another_unicode_form(tmp_path: Path, folder: 
     table.write_text(table.read_text(encoding="utf-8") + f"{name},2\n", encoding="utf-8")
     with pytest.raises(SceneError, match="expected one period of 'Su"):
         read_captures(table)
+
+
+def test_names_that_are_not_utf_8_are_refused(tmp_path: Path) -> None:
+    """Archives of old programs have names in the encoding of their country."""
+    photo(tmp_path / "a.jpg")
+    photo(tmp_path / "0" / "b.jpg")
+    photo(tmp_path / "1" / "c.jpg").rename(tmp_path / "1" / os.fsdecode(b"stra\xdfe.jpg"))
+    place = re.escape(str(tmp_path))
+    with pytest.raises(SceneError, match=rf"^{place}: expected image names in UTF-8, .*\\udcdf"):
+        read_captures(tmp_path)
+    photo(tmp_path / "1" / "c.jpg")
+    (tmp_path / "1" / os.fsdecode(b"stra\xdfe.jpg")).rename(tmp_path / os.fsdecode(b"\xdf.jpg"))
+    (tmp_path / "1" / os.fsdecode(b"\xdf.dng")).touch()
+    notes = "".join(read_captures(tmp_path).notes)  # of photos that are left out
+    assert notes.count("\\udcdf") == 2
+    assert notes.isprintable()
 
 
 def test_a_table_may_have_backslashes(tmp_path: Path) -> None:
