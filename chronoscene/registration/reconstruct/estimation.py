@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,23 +62,25 @@ def choose_route(inputs: PhotoInputs, matched: Matched, context: Context) -> Rou
     if context.options.route is not None:
         remark("route", f"{context.options.route}: requested")
         return context.options.route
-    if connected_periods(matched, len(inputs.labels)):
+    if connected_periods(matched, set(inputs.periods.values())):
         remark("route", "joint: matches connect all periods")
         return "joint"
     remark("route", "separate: matches do not connect all periods")
     return "separate"
 
 
-def connected_periods(matched: Matched, count: int) -> bool:
-    """Return True if enough matches connect all periods."""
+def connected_periods(matched: Matched, periods: Collection[int]) -> bool:
+    """Return True if enough matches connect some periods, those that have photos."""
     links = [
         tuple(int(part) for part in key.split("-"))
         for key, pairs in matched.pairs_across.items()
         if pairs >= MIN_CROSS_PAIRS and matched.matches_across[key] >= MIN_CROSS_MATCHES
     ]
     a, b = np.array(links, np.int64).reshape(-1, 2).T
+    count = max(periods) + 1
     graph = coo_matrix((np.ones(len(a)), (a, b)), (count, count))
-    return bool(connected_components(graph, directed=False)[0] == 1)
+    part = connected_components(graph, directed=False)[1]
+    return len(set(part[list(periods)].tolist())) == 1
 
 
 def _or_separate(

@@ -5,8 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
+from chronoscene.registration.features.correspondences import Matched
 from chronoscene.registration.quality.rays import cross_matches
-from chronoscene.registration.reconstruct.estimation import read_held_out, reasons, without_twins
+from chronoscene.registration.reconstruct.estimation import (
+    connected_periods,
+    read_held_out,
+    reasons,
+    without_twins,
+)
 from chronoscene.scene import Points
 
 
@@ -37,6 +43,15 @@ def test_of_twins_the_longer_track_stays() -> None:
 
 def test_no_points_have_no_twins() -> None:
     assert len(without_twins(Points.empty())) == 0
+
+
+def test_periods_are_connected_by_enough_matches() -> None:
+    across = {"0-2": 3, "2-3": 5, "0-4": 2}
+    matched = Matched({}, {}, across, dict.fromkeys(across, 100))
+    assert connected_periods(matched, {0, 2, 3})  # no photo of period 1 can be used
+    assert connected_periods(matched, {3})
+    assert not connected_periods(matched, {0, 1, 2, 3})
+    assert not connected_periods(matched, {0, 2, 4})
 
 
 def test_held_out_tracks_of_two_periods_become_matches(tmp_path: Path) -> None:
