@@ -42,6 +42,7 @@ COLUMNS = {
 column can be the pixels."""
 
 WORLD = ("world x", "world y", "world z")
+DEGREES = ("longitude", "lon", "latitude", "lat")  # Names of columns that are never in metres
 
 _CRS = re.compile(r"#\s*(?:crs(?:\s*[:=]|\s)\s*(?=\S)|(?=EPSG:\d+$))(.+)", re.IGNORECASE)
 _TODO_CSV = "write lines such as: corner1,2016/IMG_0001.jpg,812.5,334.0"
@@ -153,7 +154,7 @@ def read_tie_points(
     else:
         named = ((n, found[1].strip()) for n, line in filled if (found := _CRS.fullmatch(line)))
         crs = next((read_reference_system(f"{path}:{n}", text) for n, text in named), crs)
-        rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")])
+        rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")], crs)
     scaled = (
         replace(r, click=replace(r.click, x=scale * r.click.x, y=scale * r.click.y)) for r in rows
     )
@@ -228,13 +229,17 @@ def _assemble(path: Path, rows: Iterable[_Row], crs: ReferenceSystem | None) -> 
     return TiePoints(Path(path), points, crs)
 
 
-def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
+def _csv_rows(
+    path: Path, lines: Sequence[tuple[int, str]], crs: ReferenceSystem | None
+) -> Iterator[_Row]:
     cells = [(n, [c.strip() for c in next(csv.reader([line]))]) for n, line in lines]
     order = _header(path, *cells[0]) if cells else None
     if order is None:
         order, width = {name: i for i, name in enumerate(COLUMNS)}, len(COLUMNS)
     else:
         _check_world(path, order, *cells[0], [row for _, row in cells[1:]])
+        if crs is None or crs.is_projected:
+            _check_metres(path, *cells[0], "none" if crs is None else crs.text)
         width, cells = len(cells[0][1]), cells[1:]
     for number, row in cells:
         if any(row[width:]):
@@ -327,6 +332,16 @@ def _check_world(
         raise _wrong(
             path, number, "E, N, h, or another known name of each column of world coordinates",
             f"columns of numbers that are not known: {', '.join(others)}", "rename or remove them",
+        )  # fmt: skip
+
+
+def _check_metres(path: Path, number: int, head: Sequence[str], found: str) -> None:
+    """Refuse longitudes and latitudes, which would count as metres."""
+    names = [name for name in head if name.lower() in DEGREES]
+    if names:
+        raise _wrong(
+            path, number, f"a reference system in degrees for {' and '.join(names)}", found,
+            "write above the header: # crs: EPSG:4326; if they are metres, call the columns E, N",
         )  # fmt: skip
 
 
