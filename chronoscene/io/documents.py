@@ -57,6 +57,12 @@ def decode_text(data: bytes) -> str:
     return data.decode("utf-8-sig")
 
 
+def filled_lines(text: str) -> list[tuple[int, str]]:
+    """Number the filled lines of a table, from 1; spreadsheets leave commas in empty ones."""
+    lines = enumerate(text.splitlines(), 1)
+    return [(number, line) for number, line in lines if line.replace(",", " ").strip()]
+
+
 def read_json_document(
     place: Path,
     kind: type = dict,

@@ -79,6 +79,7 @@ def test_a_table_finds_names_in_another_unicode_form(colmap_folder, tmp_path):
     [
         ("file,date\na.png,1\n", "expected the columns file and period"),
         ("", "expected the columns file and period"),
+        ("file;period\na.png;1\n", "found file;period; separate the columns by commas"),
         ("file,period\na.png,1\n", "a period of every image, found none of 1 of 2: 'b.png'; add"),
         (
             "file,period\na.png,1\nb.png,2\na,2\n",

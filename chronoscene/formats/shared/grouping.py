@@ -17,7 +17,7 @@ from pathlib import Path
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.shared.json_values import is_iso_date
-from chronoscene.io.documents import read_text
+from chronoscene.io.documents import filled_lines, read_text
 from chronoscene.io.wording import shown
 from chronoscene.scene import Period
 from chronoscene.scene.splits import NameIndex, composed
@@ -118,8 +118,7 @@ def read_table(
     Raises:
         SceneError: If it is not a CSV file, is empty, or lacks a column.
     """
-    text = enumerate(read_text(path).splitlines(), start=1)
-    lines = [(number, line) for number, line in text if line.strip()]
+    lines = filled_lines(read_text(path))
     try:
         reader = csv.DictReader((line for _, line in lines), skipinitialspace=True)
         rows = [(f"{path}:{lines[reader.line_num - 1][0]}", row) for row in reader]
@@ -130,6 +129,8 @@ def read_table(
     if column is None or label not in columns:
         found = lines[0][1] if lines else "an empty file"
         expected = f"the columns {images[0]} and {label}, and at least one row"
+        if re.search(r"[;\t]", found):
+            raise _table_error(path, expected, found[:80], "separate the columns by commas")
         raise _table_error(path, expected, found[:80])
     return [(at, (row[column] or "").strip(), (row[label] or "").strip()) for at, row in rows]
 

@@ -22,7 +22,7 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.geodesy import Georeference, ReferenceSystem, read_reference_system
-from chronoscene.io.documents import read_text
+from chronoscene.io.documents import filled_lines, read_text
 from chronoscene.scene.splits import composed
 
 COLUMNS = {
@@ -144,15 +144,15 @@ def read_tie_points(
     Raises:
         SceneError: If a line is wrong; the message names it.
     """
-    lines = read_text(Path(path)).splitlines()
-    filled = [(n, line.strip()) for n, line in enumerate(lines, 1) if line.strip()]
+    filled = [(n, line.strip()) for n, line in filled_lines(read_text(Path(path)))]
     if not filled:
         raise SceneError(path, expected="tie points", found="an empty file", todo=_TODO_CSV)
     if re.match(r"(\+proj|EPSG:|WGS84)", filled[0][1], re.IGNORECASE):
         crs = _projection(path, filled[0][1])
         rows = _odm_rows(path, filled[1:])
     else:
-        named = ((n, found[1].strip()) for n, line in filled if (found := _CRS.fullmatch(line)))
+        plain = ((n, line.rstrip(", ")) for n, line in filled)  # commas of a spreadsheet
+        named = ((n, found[1]) for n, line in plain if (found := _CRS.fullmatch(line)))
         crs = next((read_reference_system(f"{path}:{n}", text) for n, text in named), crs)
         rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")], crs)
     scaled = (

@@ -277,7 +277,7 @@ def test_a_table_may_have_backslashes(tmp_path: Path) -> None:
     ("text", "place", "found"),
     [
         ("a.jpg,0\n", "t.csv", "a.jpg,0"),
-        ("image,period\n../x.jpg,0\n", "t.csv:2", "'../x.jpg'"),
+        ("image,period\n,\n\n../x.jpg,0\n", "t.csv:4", "'../x.jpg'"),
         ("image,period\na.jpg,\n", "t.csv:2", "''"),
         ("image,period\na.jpg,0\na.jpg,1\n", "t.csv:3", "'0' and '1'"),
         ("image,period\na.jpg,0\n./a.jpg,1\n", "t.csv:3", "'0' and '1'"),

@@ -183,6 +183,15 @@ def test_empty_fields_at_the_end_of_a_line_do_not_count(tmp_path: Path) -> None:
     assert point.clicks[0].y == 2.0
 
 
+def test_commas_that_spreadsheets_add_do_not_count(tmp_path: Path) -> None:
+    text = "# crs: EPSG:32632,,,,,,\npoint,image,x,y,E,N,h\n,,,,,,\np,a.jpg,1,2,3,4,5\n , ,,,,,\n"
+    found = read(tmp_path, text)
+    assert found.crs is not None
+    assert (found.crs.text, found.points[0].world) == ("EPSG:32632", (3.0, 4.0, 5.0))
+    with pytest.raises(SceneError, match=r"ties.csv: expected tie points, found an empty"):
+        read(tmp_path, ",,,\n")
+
+
 def test_usual_names_of_world_coordinates(tmp_path: Path) -> None:
     for names in (
         "Easting,Northing,Elevation",
