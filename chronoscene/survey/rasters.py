@@ -51,12 +51,19 @@ def write_raster(
     with MemoryFile() as memory:
         with memory.open(
             driver="GTiff", width=grid.width, height=grid.height, count=len(data),
-            dtype=data.dtype, crs=frame.crs, transform=_transform(grid), compress="deflate",
+            dtype=data.dtype, crs=_wkt(frame), transform=_transform(grid), compress="deflate",
             tiled=True, **options,
         ) as file:  # fmt: skip
             file.write(data)
             file.descriptions = tuple(bands)
         path.write_bytes(memory.getbuffer())  # GDAL itself does not report a full disk
+
+
+def _wkt(frame: MapFrame) -> str:
+    """Reference system for GDAL, which does not know all names that PROJ knows."""
+    import pyproj
+
+    return frame.crs if frame.is_local else pyproj.CRS.from_user_input(frame.crs).to_wkt()
 
 
 def _transform(grid: Grid) -> Any:
@@ -139,7 +146,7 @@ def _on_map(place: str, system: Any, feature: Any, frame: MapFrame) -> Any:
             crs = system["properties"]["name"]
             if frame.is_local:
                 raise KeyError
-        return shape if crs is None else transform_geom(crs, frame.crs, shape)
+        return shape if crs is None else transform_geom(crs, _wkt(frame), shape)
     except (CRSError, KeyError, TypeError, ValueError) as error:
         wanted, todo = "a known crs", "convert the polygons"
         if frame.is_local:

@@ -15,11 +15,12 @@ from chronoscene.survey.map_frame import LOCAL, MapFrame
 from chronoscene.survey.rasters import NODATA, read_polygons, write_raster
 
 UTM = MapFrame("EPSG:32632", np.eye(3), np.zeros(3), 0.0)
+NAMED = MapFrame("WGS 84 / UTM zone 32N", np.eye(3), np.zeros(3), 0.0)  # PROJ knows it, GDAL not
 HERE = MapFrame(LOCAL, np.eye(3), np.zeros(3), 0.0)
 GRID = Grid(680_000.0, 5_152_000.0, 0.5, 40, 30, 0.0, 10.0)
 
 
-@pytest.mark.parametrize("frame", [UTM, HERE])
+@pytest.mark.parametrize("frame", [UTM, NAMED, HERE])
 def test_a_raster_of_heights(tmp_path, frame):
     heights = np.arange(1200.0).reshape(30, 40)
     heights[3, 5] = np.nan
@@ -31,7 +32,7 @@ def test_a_raster_of_heights(tmp_path, frame):
         assert file.descriptions == ("height", "views") and (file.read(2) == 7).all()
         assert file.index(680_000.75, 5_151_999.25) == (1, 1) and file.res == (0.5, 0.5)
         assert next(file.sample([(680_003.1, 5_151_998.4)]))[0] == heights[3, 6]
-        if frame is UTM:
+        if frame is not HERE:
             assert file.crs.to_epsg() == 32632
         else:
             assert "local metres" in file.crs.to_wkt() and not file.crs.is_projected
@@ -116,6 +117,8 @@ def test_polygons_in_each_system(tmp_path):
         assert list(made) == ["pit"]
         np.testing.assert_array_equal(made["pit"].cells, cells)
         assert made["pit"].on_map == 1
+    named = read(tmp_path, geojson(degrees, name="pit"), NAMED)
+    np.testing.assert_array_equal(named["pit"].cells, cells)
     near = Grid(0.0, 10.0, 0.5, 40, 30, 0.0, 10.0)
     local = read(tmp_path, geojson(SQUARE - [680_000, 5_151_990])["features"][0], HERE, near)
     np.testing.assert_array_equal(local["1"].cells, cells)
