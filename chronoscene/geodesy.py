@@ -171,10 +171,17 @@ def read_reference_system(
     return ReferenceSystem(text, bool(crs.is_projected), unit, axes)
 
 
-def read_projected(place: str, text: str, *, metres: bool = False) -> ReferenceSystem:
+def read_projected(
+    place: str,
+    text: str,
+    *,
+    metres: bool = False,
+    todo: str = "choose the UTM zone of the place (--crs), for example",
+) -> ReferenceSystem:
     """Parse the reference system of an output, which must be projected, and in metres if asked.
 
     Its axes must point east and north: what is written is called so, and cameras are turned by it.
+    ``todo`` is the advice where they do not, or it is of another kind.
 
     Raises:
         ConfigError: If it is not, or as `read_reference_system`.
@@ -191,7 +198,7 @@ def read_projected(place: str, text: str, *, metres: bool = False) -> ReferenceS
             expected=f"a projected reference system{' in metres' * metres}, with axes east and "
             "north, such as EPSG:32632",
             found=f"{found} ({text})",
-            todo="choose the UTM zone of the place (--crs), for example",
+            todo=todo,
         )
     return system
 

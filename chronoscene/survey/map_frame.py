@@ -131,7 +131,8 @@ def _conversion(
         return target.text, lambda xyz: target.from_local(local, xyz + shift)
     import pyproj
 
-    source = read_projected(str(scene.root), world_crs, metres=True)
+    todo = "correct crs in sparse/world.json; with null, products are in the metres of the scene"
+    source = read_projected(str(scene.root), world_crs, metres=True, todo=todo)
     target = source if crs is None else read_projected("--crs", crs, metres=True)
     transform = pyproj.Transformer.from_crs(source.text, target.text, always_xy=True).transform
 

@@ -88,7 +88,8 @@ def test_local_metres(scene):
         (WorldFrame("metre", PLACE.crs), "EPSG:5513", ConfigError, "axes point south and west"),
         (WorldFrame("metre", PLACE.crs), "EPSG:32755", ConfigError, "scale is 1 in this region"),
         (WorldFrame("metre", PLACE.crs), "EPSG:3857", ConfigError, r"found scale 1\.45"),
-        (WorldFrame("metre", "EPSG:4326"), None, ConfigError, "found one in degrees"),
+        (WorldFrame("metre", "EPSG:4326"), None, ConfigError, "found one in degrees.*world.json"),
+        (WorldFrame("metre", "EPSG:6424"), "EPSG:32632", ConfigError, "in feet.*world.json"),
     ],
 )
 def test_errors(scene, world, crs, error, message):
