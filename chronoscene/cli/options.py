@@ -40,6 +40,19 @@ class FiniteRange(FiniteFloat, click.FloatRange):
     """A finite number in a range."""
 
 
+class OneOfSeveral(click.types.StringParamType):
+    """A value of an option that takes several, which click fills up with the next option."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Refuse the name of an option of the command."""
+        text: str = super().convert(value, param, ctx)
+        known = {name for p in ctx.command.params for name in p.opts} if ctx is not None else ()
+        if text.startswith("-") and text.partition("=")[0] in known:
+            values = "another value" if param is None else str(param.metavar)
+            self.fail(f"expected {values}, found the option {text} in place of one", param, ctx)
+        return text
+
+
 def _period_help() -> str:
     known = {name: getattr(it, "PERIOD_BY", ()) for name, it in formats_that_load().items()}
     rules = "; ".join(f"{name}: {', '.join(by)}" for name, by in known.items() if by)

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import COMMANDS, cli
-from chronoscene.cli.options import FiniteFloat, refuse_options
+from chronoscene.cli.options import FiniteFloat, OneOfSeveral, refuse_options
 from chronoscene.errors import ConfigError
 
 
@@ -51,3 +51,19 @@ def test_options_without_an_effect_are_refused_by_name(arguments, message):
     assert CliRunner().invoke(command, []).exit_code == 0
     refused = CliRunner().invoke(command, arguments).exception
     assert isinstance(refused, ConfigError) and re.match(message, str(refused))
+
+
+@pytest.mark.parametrize("option", ["--out", "--out=maps"])
+def test_an_option_in_place_of_one_of_several_values_is_named(option):
+    rest = [option] if "=" in option else [option, "maps"]
+    result = CliRunner().invoke(cli, ["changes", "run", "--between", "before", *rest])
+    assert result.exit_code == 2
+    message = f"'--between': expected PERIOD PERIOD, found the option {option} in place of one"
+    assert message in result.output
+
+
+def test_options_of_several_values_know_the_options():
+    context = click.Context(cli)
+    options = [option for name in COMMANDS for option in cli.get_command(context, name).params]
+    several = [o for o in options if isinstance(o, click.Option) and o.nargs > 1]
+    assert several and all(isinstance(option.type, OneOfSeveral) for option in several)

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE
+from chronoscene.cli.options import DEVICE, PATH, PLUGIN, RUN, SCENE, OneOfSeveral
 from chronoscene.cli.output import emit, report_written, say, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -25,6 +25,7 @@ from chronoscene.io.tables import boxed_text
 TITLE = 42  # Letters of both labels that fit above a map
 BETWEEN = click.option(
     "--between",
+    type=OneOfSeveral(),
     nargs=2,
     multiple=True,
     metavar="PERIOD PERIOD",
