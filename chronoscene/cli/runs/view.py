@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import click
@@ -70,14 +74,30 @@ def command(
         refuse_options(("scene", "plugin", "device"), "without a run")
         found = read_and_note(folders[0], dataset_format, period_by)
         content = Content(found, summary=certificate_summary(folders[0]))
-    server = ViewServer(content, host, chosen)
+    server, status = ViewServer(content, host, chosen), 128 + signal.SIGTERM
     try:
         _report(host, server.port, port or PORT)
         threading.Event().wait()
     except KeyboardInterrupt:
         say("ended")
+        status = 0
     finally:
-        server.stop()
+        _stop(server, status)
+
+
+def _stop(server: ViewServer, status: int) -> None:
+    """Stop the server; end the process, too, if it is in the middle of a picture.
+
+    A picture may take minutes. The interpreter would end its thread by unwinding it, which aborts
+    where frames of C++ allow no exceptions.
+    """
+    has_ended = False
+    with suppress(KeyboardInterrupt):  # a second one
+        has_ended = server.stop()
+    if not has_ended:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
 
 
 def _report(host: str, port: int, wanted: int) -> None:

@@ -89,14 +89,14 @@ class ViewServer:
         self._server.on_client_connect(self._enter)
         self._server.on_client_disconnect(self._leave)
 
-    def stop(self) -> None:
-        """Disconnect all browsers and stop to serve."""
+    def stop(self) -> bool:
+        """Disconnect all browsers and stop to serve; False if a picture is still being drawn."""
         for viewer in [*self.viewers.values()]:
             viewer.close()
-        if self._worker is not None:
-            self._worker.stop()
+        has_ended = self._worker is None or self._worker.stop()
         with redirect_stdout(io.StringIO()):
             self._server.stop()
+        return has_ended
 
     def _enter(self, client: viser.ClientHandle) -> None:
         viewer = Viewer(client, self._content, self._worker)

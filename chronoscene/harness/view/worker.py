@@ -122,12 +122,13 @@ class RenderWorker:
                 raise CancelledError
             return render()
 
-    def stop(self) -> None:
-        """End the thread after the picture that is being drawn."""
+    def stop(self) -> bool:
+        """End the thread after the picture that is being drawn; False if that takes long."""
         with self._changed:
             self._stopped = True
             self._changed.notify()
         self._thread.join(PATIENCE)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while (seat := self._next()) is not None:

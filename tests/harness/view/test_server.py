@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from fresh_process import run_python
 from PIL import Image
 from waiting import wait_for
 
@@ -341,6 +342,26 @@ def test_the_command_ends_at_an_interruption_and_needs_no_torch(scene_folder):
     assert process.returncode == 0
     assert out == "False\n"
     assert "Traceback" not in err and "viser" not in err
+
+
+def test_the_command_leaves_in_the_middle_of_a_picture(scene_folder):
+    """A thread that the interpreter ends in C++, as of torch, aborts the process."""
+    code = """
+import atexit, sys
+from chronoscene.cli import main
+from chronoscene.cli.runs import view
+class Server:
+    port = 1
+    def __init__(self, *arguments): pass
+    def stop(self): return False
+def interrupt(*arguments):
+    raise KeyboardInterrupt
+view.ViewServer, view._report = Server, interrupt
+atexit.register(print, "the interpreter has ended the threads")
+sys.argv[1:] = ["view", sys.argv[1]]
+main()
+"""
+    assert run_python(code, scene_folder) == ""
 
 
 CERTIFICATE = {

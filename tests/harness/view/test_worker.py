@@ -72,6 +72,16 @@ def test_the_worker_learns_what_takes_its_time_anyway(worker):
     assert pixels[2] < pixels[0] < pixels[11]
 
 
+def test_stopping_tells_if_a_picture_goes_on(worker, monkeypatch):
+    monkeypatch.setattr("chronoscene.harness.view.worker.PATIENCE", 0.05)
+    begun, go = threading.Event(), threading.Event()
+    worker.request("a", lambda pixels: begun.set() or go.wait(10), SIZE)
+    assert begun.wait(10)
+    assert not worker.stop()
+    go.set()
+    wait_for(worker.stop)
+
+
 def test_only_the_newest_request_is_drawn(worker):
     begun, go, drawn = threading.Event(), threading.Event(), []
 
