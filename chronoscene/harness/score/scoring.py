@@ -154,7 +154,7 @@ def score_job(job: Job, record: RunRecord) -> None:
 def score_pair(
     image: Pixels, reference: Pixels, scorers: Scorers, mask: Mask | None = None
 ) -> tuple[Values, dict[str, str]]:
-    """Compute the values of one view, and reasons where its size or mask does not allow them.
+    """Compute the values of one view, and reasons why it has no others.
 
     Args:
         image: The prediction. [H, W, 3]
@@ -168,9 +168,14 @@ def score_pair(
         image = np.where(mask[..., None], image, reference)
     for name, function in scorers.functions.items():
         try:
-            values[name] = function(image, reference, mask)
+            value = function(image, reference, mask)
         except ShapeError as error:
             refused[name] = str(error)
+            continue
+        if math.isnan(value):  # of a metric of another package: no record can hold it
+            refused[name] = "its value is not a number"
+        else:
+            values[name] = value
     return values, refused
 
 

@@ -145,6 +145,16 @@ def test_a_metric_that_one_view_does_not_allow_is_absent_with_a_reason(tmp_path)
     assert "b.png" in scores.skipped["ssim_valid"] and "11 x 11" in scores.skipped["ssim_valid"]
 
 
+def test_a_metric_that_gives_no_number_is_absent_with_a_reason(tmp_path):
+    """A record with NaN could not be read again."""
+    images = {"a.png": noise(0), "b.png": noise(1)}
+    predictions, truth = write(tmp_path / "p", images), write(tmp_path / "t", images)
+    functions = {"psnr": lambda *given: 12.5, "ssim": lambda *given: math.nan}
+    scores = score_folder(predictions, truth, Scorers(functions, {}))
+    assert {r.metric for r in scores.rows} == {"psnr"}
+    assert scores.skipped == {"ssim": "b.png: its value is not a number"}
+
+
 def test_an_image_of_another_period_is_no_prediction_of_a_photo(tmp_path):
     truth = write(tmp_path / "t", {"a.png": noise(0)})
     writer = ImageWriter(tmp_path / "p")
