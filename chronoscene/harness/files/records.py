@@ -21,7 +21,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from chronoscene.errors import CheckpointError
-from chronoscene.io.documents import plain_file
+from chronoscene.io.documents import plain_file, read_text
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.methods import PeriodSharing
@@ -390,6 +390,9 @@ def write_summary(runs: Path, without: Collection[Path] = ()) -> list[RunRecord]
     Args:
         runs: The folder.
         without: Runs that are left out.
+
+    Raises:
+        CheckpointError: If a file of a run is missing or damaged.
     """
     from filelock import FileLock
 
@@ -402,6 +405,7 @@ def write_summary(runs: Path, without: Collection[Path] = ()) -> list[RunRecord]
         write_text_atomic(runs / RESULTS_FILE, text)
         lines = [",".join((*RUN_COLUMNS, *ROW_COLUMNS)) + "\n"]
         for folder in folders:
-            lines += (folder / ROWS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)[1:]
+            rows = read_text(folder / ROWS_FILE, error=CheckpointError)
+            lines += rows.splitlines(keepends=True)[1:]
         write_text_atomic(runs / ROWS_FILE, "".join(lines))
     return records

@@ -315,7 +315,7 @@ def rescore(
 ) -> list[Rescored]:
     """Score every finished run below a folder again.
 
-    Runs whose record is damaged are not in the summary that is written.
+    Runs whose record is damaged, or whose rows are gone, are not in the summary that is written.
 
     Args:
         runs: Folder that bench wrote.
@@ -340,6 +340,8 @@ def rescore(
             damaged.append(folder)
             continue
         outcomes.append(_rescore_one(runs, folder, record, scorers))
+        if not (folder / ROWS_FILE).is_file():
+            damaged.append(folder)
     if len(damaged) < len(folders):
         write_summary(runs, without=damaged)
     return outcomes

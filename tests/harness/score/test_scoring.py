@@ -8,7 +8,14 @@ import pytest
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files.predictions import ImageWriter, encode_png
-from chronoscene.harness.files.records import ViewScore, read_rows, read_run, run_folders, write_run
+from chronoscene.harness.files.records import (
+    ViewScore,
+    read_rows,
+    read_run,
+    run_folders,
+    write_run,
+    write_summary,
+)
 from chronoscene.harness.score.scoring import aggregate, changes, rescore, score_folder
 from chronoscene.metrics.registry import Scorers, make_scorers
 
@@ -250,6 +257,17 @@ def test_a_damaged_record_is_an_error_for_its_run_only(runs, scorers):
     assert "run.json" in outcomes[JOINT].error
     assert [o.error for name, o in outcomes.items() if name != JOINT] == [None] * 3
     assert len(json.loads((runs / "results.json").read_text())) == 3
+
+
+def test_rows_that_are_gone_are_an_error_for_their_run_only(runs):
+    (runs / JOINT / "rows.csv").unlink()
+    found = rescore(runs, make_scorers(["psnr"]))  # the others keep their values
+    outcomes = {str(o.folder.relative_to(runs)): o for o in found}
+    assert "rows.csv" in outcomes[JOINT].error
+    assert [o.error for name, o in outcomes.items() if name != JOINT] == [None] * 3
+    assert len(json.loads((runs / "results.json").read_text())) == 3
+    with pytest.raises(CheckpointError, match=r"rows\.csv: expected a text file, found nothing"):
+        write_summary(runs)
 
 
 def test_values_of_a_metric_that_is_not_installed_are_not_lost(runs, scorers):
