@@ -88,6 +88,7 @@ def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> Non
         strategy=job.strategy,
         preset=settings.preset_name,
         variant=job.variant,
+        protocol=settings.protocol,
         seed=job.seed,
         seconds=sum(model.seconds for model in trained),
         iterations=None if None in iterations else sum(filter(None, iterations)),

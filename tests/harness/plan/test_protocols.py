@@ -8,6 +8,7 @@ import pytest
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.protocols import PROTOCOLS
+from chronoscene.harness.files.records import read_run
 from chronoscene.harness.plan.plan import plan_runs
 from chronoscene.harness.plan.settings import BenchSettings, bench_settings
 from chronoscene.harness.report.published import load_published
@@ -82,6 +83,13 @@ def test_a_run_outside_of_the_protocol_is_another(stand_in):
     assert usual != folder
     assert run.document["config_hash"] != other.document["config_hash"]
     assert "protocol" not in run.document["config"]
+
+
+def test_records_of_other_programs_name_the_protocol_too(stand_in, bench_here):
+    scenes, options = (stand_in("cl-splats"),), PROTOCOLS["cl-splats"].options()
+    options["strategies"] = ("joint",)
+    outcome, _ = bench_here("toy_programs:PROGRAM", scenes=scenes, protocol="cl-splats", **options)
+    assert read_run(outcome.finished[0]).protocol == "cl-splats"
 
 
 @pytest.mark.parametrize(
