@@ -80,8 +80,10 @@ def put_in_place(job: Job, staging: Path) -> records.Failure | None:
 
 def settle_training(job: Job) -> None:
     """Remove the checkpoints of a finished run, or keep them with it."""
-    finished = (job.folder / records.RUN_FILE).is_file()
-    if not finished or not (job.training / records.CONFIG_FILE).is_file():
+    if not (job.folder / records.RUN_FILE).is_file() or not job.training.is_dir():
+        return
+    if not (job.training / records.CONFIG_FILE).is_file():
+        shutil.rmtree(job.training)  # what an interrupted deletion has left
         return
     if records.read_config(job.training) != records.read_config(job.folder):
         return  # of a longer training that is under way
