@@ -18,6 +18,7 @@ from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.records import (
     CHECKPOINT,
     PREDICTIONS,
+    RUN_FILE,
     STAGES,
     RunRecord,
     read_config,
@@ -403,8 +404,6 @@ def open_run(
     check_choice("device", device, ("cpu", "cuda"))
     folder = Path(folder)
     record = read_run(folder)
-    if stage is not None:
-        record = _at_stage(record, stage)
     if not (folder / CHECKPOINT).is_dir():
         raise CheckpointError(
             folder,
@@ -412,6 +411,9 @@ def open_run(
             found=f"no folder {CHECKPOINT}",
             todo="open a run that bench trained, with its checkpoint",
         )
+    check_choice(f"{folder / RUN_FILE}: strategy", record.strategy, STRATEGIES)
+    if stage is not None:
+        record = _at_stage(record, stage)
     source = read_source(folder)
     spec = _find_spec(record, source, [plugin] if isinstance(plugin, str) else plugin)
     if spec.runner is not None:

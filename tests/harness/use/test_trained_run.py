@@ -237,6 +237,13 @@ def test_a_run_that_is_not_in_stages_has_none(runs):
         open_run(folder_of(runs), stage=0)
 
 
+def test_a_strategy_that_bench_does_not_know(runs):
+    path = folder_of(runs) / "run.json"
+    path.write_text(path.read_text().replace('"strategy": "joint"', '"strategy": "external"'))
+    with pytest.raises(ConfigError, match=r"run\.json: strategy: expected one of joint, "):
+        open_run(path.parent, stage=0)
+
+
 def test_a_run_without_its_model(runs):
     folder = folder_of(runs, "separate")
     (folder / "checkpoint" / "period-1").rename(folder / "elsewhere")
