@@ -3,7 +3,8 @@
 `run_worker` calls a function in a fresh interpreter. The job goes in as JSON, progress and the
 result come back as lines of JSON, and large results stay in files. The worker ends when its parent
 does, even if the parent is killed, with all programs that it started; a crash of the worker is
-reported and harms nothing else. `map_parallel` maps a function over items in a pool.
+reported and harms nothing else. `map_parallel` maps a function over items in a pool of processes,
+which end with their parent, too.
 
 Some modules are imported inside functions: ``chronoscene --help`` loads this module.
 """
@@ -320,8 +321,9 @@ def _pooled(
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
+    spawned, ours = get_context("spawn"), (os.getpid(),)
     with _safe_path():
-        pool = ProcessPoolExecutor(workers, get_context("spawn"))  # starts one that keeps watch
+        pool = ProcessPoolExecutor(workers, spawned, _end_with, ours)  # starts one that keeps watch
     try:
         with _safe_path():
             results = pool.map(partial(_stoppably, function), items)  # starts the others

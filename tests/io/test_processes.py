@@ -119,6 +119,9 @@ def sleeps(job, report):
         file.write(str(os.getpid()))
     time.sleep(60)
 
+def own_number(item):
+    return os.getpid()
+
 def variables(job, report):
     return [os.environ.get(name) for name in job]
 
@@ -182,6 +185,24 @@ def test_a_worker_ends_with_its_parent_even_if_that_is_killed(jobs, tmp_path):
     parent = subprocess.Popen([sys.executable, "-c", code])
     wait_for(lambda: mark.exists() and mark.read_text() != "")
     worker = int(mark.read_text())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    wait_for(lambda: not Path(f"/proc/{worker}").exists())
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+def test_a_pool_ends_with_its_parent_even_if_that_is_killed(jobs):
+    """Its processes would wait for items for ever."""
+    code = (
+        "import time\n"
+        "from chronoscene.io.processes import map_parallel\n"
+        "from some_jobs import own_number\n"
+        "results = map_parallel(own_number, [1, 2, 3], workers=2)\n"
+        "print(next(results), flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    worker = int(parent.stdout.readline())
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     wait_for(lambda: not Path(f"/proc/{worker}").exists())
