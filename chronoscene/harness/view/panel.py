@@ -9,6 +9,10 @@ from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.arrays import Array
 from chronoscene.errors import ChronoSceneError
 from chronoscene.figures.canvas import UNSEEN
 from chronoscene.harness.files.predictions import to_bytes
@@ -197,19 +201,21 @@ class Viewer:
         """Draw a picture and send it; called by the worker."""
         try:
             rgb, depth = draw_picture(view, size, sides, pixels, float(self._wipe.value))
+            self._send(rgb, depth, complete=pixels >= min(math.prod(size), FULL))
+            self._refused = ""
         except Exception as error:  # the other viewers go on
             if str(error) != self._refused:  # once, not for each picture
                 self._notify(error)
             self._refused = str(error)
-            return
-        self._refused = ""
+
+    def _send(self, rgb: NDArray[np.float32], depth: Array, *, complete: bool) -> None:
         objects = self._points.value != POINTS[0] or self._cameras.value or self._changes.value
         scale = self._content.view_from_world.scale * (BEHIND if self._changes.value else 1)
         if not self._closed:
             self._client.scene.set_background_image(
                 color_depth(depth) if self._depth.value else to_bytes(rgb),
                 "jpeg",
-                jpeg_quality=QUALITY if pixels >= min(math.prod(size), FULL) else DRAFT_QUALITY,
+                jpeg_quality=QUALITY if complete else DRAFT_QUALITY,
                 depth=scale * depth if objects else None,
             )
             self._client.flush()

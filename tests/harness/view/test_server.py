@@ -10,6 +10,7 @@ import sys
 import warnings
 from contextlib import ExitStack
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from chronoscene.harness.view.content import Content
 from chronoscene.harness.view.panel import POINTS
 from chronoscene.harness.view.server import PORT, ViewServer, choose_port, tunnel_command
 from chronoscene.harness.view.summary import certificate_summary
+from chronoscene.methods import Prediction
 from chronoscene.scene import Period
 
 pytest.importorskip("viser", reason="viser is not installed")
@@ -207,6 +209,27 @@ def test_an_error_is_shown_and_the_viewer_goes_on(trained, serve, monkeypatch):
     assert str(broken) in str(note)
     browser.set("Period", 0.0)
     assert np.abs(browser.picture() - before).max() == 0
+
+
+class Grey:
+    """A run that shows one colour at one depth."""
+
+    spec = SimpleNamespace(title="Grey", outputs=("rgb", "depth"))
+    record = SimpleNamespace(strategy="joint")
+    separates_appearance = distinguishes_periods = is_continuous = False
+
+    def render(self, camera, pose, period, **options):
+        depth = np.ones((camera.height, camera.width), np.float32)
+        return Prediction(rgb=np.repeat(depth[..., None] / 2, 3, axis=2), depth=depth)
+
+
+def test_a_canvas_that_no_picture_fills_stops_no_other_viewer(scene_folder, serve):
+    server = serve(Content(read_scene(scene_folder), [Grey()]))
+    Browser(server.port, (70_000, 2)).look((0, 0, 0))  # JPEG has 65,535 pixels at most
+    wait_for(lambda: server._worker._seats)
+    (wide,) = server._worker._seats.values()
+    wait_for(lambda: wide.drawn == wide.full)
+    enter(server).picture()
 
 
 def test_a_scene_has_points_and_cameras(scene_folder, serve):
