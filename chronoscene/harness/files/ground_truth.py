@@ -65,8 +65,11 @@ def _write_ground_truth(folder: Path, scene: Scene, scene_hash: str, max_width: 
                 scene_hash=scene_hash,
                 details={"max_width": max_width},
             )
-        if not folder.exists():  # another bench may have written it meanwhile
+        try:
             os.replace(partial, folder)
+        except OSError:
+            if not folder.is_dir():  # else another bench has written it meanwhile
+                raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
