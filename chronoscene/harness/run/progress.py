@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from chronoscene.io.log import Log
 from chronoscene.io.processes import Report
-from chronoscene.io.wording import format_time
+from chronoscene.io.wording import format_time, printable
 
 KNOWN = 0.1  # Share of a run after which rate and time left are shown: before, it mostly starts
 
@@ -49,6 +49,7 @@ class RunsDisplay:
     def log(self, line: str) -> None:
         """Print a line above the bar."""
         if self._live:
+            line = printable(line)
             self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
         else:
             self._log(line)

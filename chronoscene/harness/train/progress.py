@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from chronoscene.harness.plan.stop import StopRule
 from chronoscene.io.processes import Report
-from chronoscene.io.wording import format_time
+from chronoscene.io.wording import format_time, printable
 from chronoscene.methods import StepReport
 
 REFRESH = 0.1  # Seconds between two updates of the bar
@@ -86,7 +86,7 @@ class ProgressDisplay:
         """Print a line above the bar."""
         if self._report is not None:
             self._report(f"{self._name}: {line}", 0, 0)
-        self.console.print(f"{self._name}: {line}", highlight=False, markup=False, soft_wrap=True)
+        self._print(f"{self._name}: {line}")
 
     def update(
         self, iteration: int, seconds: float, report: StepReport, psnr: float | None
@@ -113,10 +113,11 @@ class ProgressDisplay:
         """Replace what the bar shows."""
         if self._task is not None:
             self._bar.remove_task(self._task)
-        self._task = self._bar.add_task(step, total=total, status=status)
+        self._task = self._bar.add_task(printable(step), total=total, status=status)
 
     def _print(self, line: str) -> None:
-        self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        """Print a line, in which names of scenes are only text."""
+        self.console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
     def status(self, iteration: int, seconds: float, psnr: float | None) -> str:
         """Return the state of the training in one line."""

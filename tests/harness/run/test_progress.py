@@ -47,6 +47,24 @@ def test_on_a_narrow_terminal_there_is_a_bar_with_everything():
     assert "━" in text
 
 
+ESCAPE = "\x1b]0;title\x07\x1b[3J\u202e"
+"""Names of strangers may be commands to a terminal."""
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_names_are_text_to_a_terminal(live):
+    buffer, lines = io.StringIO(), []
+    console = Console(file=buffer, force_terminal=live, width=200, color_system=None)
+    with ProgressDisplay(f"plaza{ESCAPE}: toy", console) as display:
+        display.wait(f"trains {ESCAPE}")
+        display.begin("all", StopRule(100, None))
+        display.log(f"no checkpoint: {ESCAPE}")
+    with RunsDisplay(1, lines.append, console) as runs, runs.showing() as report:
+        report(f"note: {ESCAPE}", 0, 0)
+    assert r"plaza\x1b]0;title\x07\x1b[3J\u202e" in buffer.getvalue()
+    assert not any(sign in buffer.getvalue() for sign in ("\x1b]", "\x07", "\x1b[3J", "\u202e"))
+
+
 def test_the_loss_is_smoothed():
     display = ProgressDisplay("x", Console(file=io.StringIO()))
     display.begin("all", StopRule(10, None))
