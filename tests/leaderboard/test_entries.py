@@ -49,7 +49,7 @@ HOSTILE = {
         lambda d: set_all(d, title="<img src=x onerror=alert(1)>"),
         "title is no plain",
     ),
-    "script in a key": (lambda d: first(d)["period_labels"].update({"<b>": "x"}), "markup"),
+    "script in a key": (lambda d: first(d)["skipped"].update({"<b>": "x"}), "markup"),
     "quotes in a name": (lambda d: set_all(d, scene='x" onload="y'), "scene is no plain name"),
     "path in a scene": (lambda d: set_all(d, scene="../../etc"), "scene is no plain name"),
     "path in a view": (lambda d: view(d).update(view="../../x.png"), "leads out of its folder"),

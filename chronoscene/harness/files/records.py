@@ -52,6 +52,7 @@ def _number(value: float) -> float:
 
 
 Number = Annotated[float, AfterValidator(_number)]
+PeriodId = Annotated[str, Field(pattern="^[0-9]{1,9}$")]
 Values = dict[str, float]
 Document = TypeVar("Document", bound=BaseModel)
 Line = TypeVar("Line", bound="CurvePoint | ViewScore")
@@ -101,7 +102,7 @@ class RunRecord(BaseModel):
     seed: int
     aggregates: dict[str, dict[str, Number]]
     """``macro`` (mean over periods), ``micro`` (mean over views), ``worst`` (worst period)."""
-    periods: dict[str, dict[str, Number]]
+    periods: dict[PeriodId, dict[str, Number]]
     """Mean over the views of each period, by period id."""
     regions: dict[str, dict[str, dict[str, dict[str, Number]]]] = {}
     """``changed`` and ``invariant`` to ``aggregates`` and ``periods`` of these parts of the images;
@@ -150,7 +151,7 @@ class RunRecord(BaseModel):
     """Hash of everything that decides the result but scene, seed, device and threads."""
     scene_hash: str
     split_hash: str
-    period_labels: dict[str, str]
+    period_labels: dict[PeriodId, str]
     parameters: int | None
     """Numbers stored in the checkpoint."""
     warmup_seconds: float | None

@@ -8,6 +8,7 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from made_runs import write_scored
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.files import records
@@ -41,6 +42,16 @@ def test_infinite_psnr_is_plain_json(runs):
     assert read_rows(runs / JOINT) == rows
     write_summary(runs)
     json.loads((runs / "results.json").read_text(), parse_constant=refuse)
+
+
+@pytest.mark.parametrize("field", ["periods", "period_labels"])
+def test_a_period_that_is_no_number_is_damage(tmp_path, field):
+    path = write_scored(tmp_path) / "run.json"
+    document = json.loads(path.read_text())
+    document[field]["x"] = document[field]["0"]
+    path.write_text(json.dumps(document))
+    with pytest.raises(CheckpointError, match=rf"run\.json: expected what .*\({field}\.x"):
+        read_run(path.parent)
 
 
 def test_a_summary_has_the_runs_that_another_command_finishes_meanwhile(runs, monkeypatch):
