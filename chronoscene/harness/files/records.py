@@ -383,6 +383,18 @@ def _is_final(folder: Path) -> bool:
     return folder.name.removeprefix("seed").isdigit()
 
 
+def damaged_runs(runs: Path) -> dict[Path, str]:
+    """Return the finished runs below a folder that `write_summary` cannot read, and why."""
+    found = {}
+    for folder in run_folders(runs):
+        try:
+            read_run(folder)
+            read_text(folder / ROWS_FILE, error=CheckpointError)
+        except CheckpointError as error:
+            found[folder] = str(error)
+    return found
+
+
 def write_summary(runs: Path, without: Collection[Path] = ()) -> list[RunRecord]:
     """Write ``results.json`` and ``rows.csv`` of all finished runs below a folder.
 

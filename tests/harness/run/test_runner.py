@@ -178,6 +178,18 @@ def test_finished_runs_are_kept_and_failed_ones_tried_again(bench_here, runs):
     assert [f.method for f in outcome.failures] == ["raises"]
 
 
+@pytest.mark.parametrize("file", [records.RUN_FILE, records.ROWS_FILE])
+def test_a_damaged_run_of_another_command_is_left_out(bench_here, tmp_path, file):
+    toy, runs = "toy_methods:MEAN", tmp_path / "runs"
+    (first,), (damaged,) = (bench_here(toy, seeds=(i,))[0].finished for i in (0, 1))
+    (damaged / file).write_bytes(b"\xff")
+    outcome, said = bench_here(toy, seeds=(2,))
+    assert [run["seed"] for run in json.loads((runs / "results.json").read_text())] == [0, 2]
+    assert len(outcome.finished) == 1 and first.is_dir()
+    (notice,) = (line for line in said if line.startswith("left out of results.json: "))
+    assert str(damaged / file) in notice
+
+
 def test_other_settings_are_refused_or_replace(bench_here, runs):
     folder = runs / "ring/mean-joint-balanced/seed0"
     with pytest.raises(ConfigError, match=r"with device cpu, found .* with device auto;"):
