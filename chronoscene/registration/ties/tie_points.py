@@ -239,7 +239,7 @@ def _csv_rows(
     else:
         _check_world(path, order, *cells[0], [row for _, row in cells[1:]])
         if crs is None or crs.is_projected:
-            _check_metres(path, *cells[0], "none" if crs is None else crs.text)
+            _check_metres(path, order, *cells[0], "none" if crs is None else crs.text)
         width, cells = len(cells[0][1]), cells[1:]
     for number, row in cells:
         if any(row[width:]):
@@ -335,9 +335,12 @@ def _check_world(
         )  # fmt: skip
 
 
-def _check_metres(path: Path, number: int, head: Sequence[str], found: str) -> None:
+def _check_metres(
+    path: Path, order: Mapping[str, int], number: int, head: Sequence[str], found: str
+) -> None:
     """Refuse longitudes and latitudes, which would count as metres."""
-    names = [name for name in head if name.lower() in DEGREES]
+    used = [head[order[key]] for key in WORLD if key in order]
+    names = [name for name in used if name.lower() in DEGREES]
     if names:
         raise _wrong(
             path, number, f"a reference system in degrees for {' and '.join(names)}", found,

@@ -207,13 +207,15 @@ def test_usual_names_of_world_coordinates(tmp_path: Path) -> None:
 
 def test_degrees_are_not_read_as_metres(tmp_path: Path) -> None:
     text = "point,image,x,y,Latitude,Longitude,height\np,a.jpg,1,2,48.1,11.5,510\n"
-    expected = "expected a reference system in degrees for Latitude and Longitude, found"
+    expected = "expected a reference system in degrees for Longitude and Latitude, found"
     with pytest.raises(SceneError, match=rf"ties.csv:1: {expected} none; write .* EPSG:4326"):
         read(tmp_path, text)
     with pytest.raises(SceneError, match=rf"ties.csv:2: {expected} EPSG:32632; .* call .* E, N"):
         read(tmp_path, f"# crs: EPSG:32632\n{text}")
     (point,) = read(tmp_path, f"# crs: EPSG:4326\n{text}").points
     assert point.world == (11.5, 48.1, 510.0)
+    (point,) = read(tmp_path, "point,image,x,y,lon,lat,X,Y,Z\np,a.jpg,1,2,11,48,3,4,5\n").points
+    assert point.world == (3.0, 4.0, 5.0)  # the others are not used
 
 
 @pytest.mark.parametrize(
