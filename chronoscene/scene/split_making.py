@@ -163,14 +163,15 @@ def hold_out_validation(scene: Scene) -> Scene:
         masks={f.name: scene.masks[f.name] for f in frames if f.name in scene.masks},
     )
     blocks = min(len(frames), round(2 / FRACTION))
-    split = make_split(whole, SplitSettings("blocked", seed=0, blocks=blocks)).scene
-    if not split.select(split="test"):
+    try:
+        split = make_split(whole, SplitSettings("blocked", seed=0, blocks=blocks)).scene
+    except ConfigError as error:
         raise SceneError(
             f"{scene.root}: validation",
             expected="a period with two training images or more",
             found=f"{len(frames)} training images in {scene.num_periods} periods",
             todo="move some from test to train, or use another scene",
-        )
+        ) from error
     return replace(split, split_rule="blocked split of the training images")
 
 
@@ -264,6 +265,13 @@ def blocked(scene: Scene, settings: SplitSettings, times: Times) -> set[str]:
     block = cut_into_blocks(centres, count)
     wanted = max(1, round(settings.fraction * count))
     chosen = choose_blocks(block, scene.frame_periods, wanted=wanted, seed=settings.seed or 0)
+    if not chosen:
+        raise ConfigError(
+            "split",
+            expected="a block whose images can be held out",
+            found=f"{count} blocks, each with all images of a period",
+            todo="ask for more blocks (--blocks), or hold out whole periods (--strategy periods)",
+        )
     return {f.name for f, b in zip(scene.frames, block.tolist(), strict=True) if b in chosen}
 
 

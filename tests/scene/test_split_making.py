@@ -124,6 +124,12 @@ def test_blocks_are_the_same_in_all_periods(seed):
         assert split.scene.select(split="train", period=period)
 
 
+def test_blocks_that_all_hold_a_whole_period_are_refused():
+    centres = 50.0 * np.repeat(np.arange(3), 2)[:, None] + np.arange(3)
+    with pytest.raises(ConfigError, match="found 3 blocks, each with all images of a period"):
+        make_split(make_scene([0, 0, 1, 1, 2, 2], centres), SplitSettings("blocked", blocks=3))
+
+
 @pytest.mark.parametrize("fraction", [0.05, 0.125, 0.3, 0.5, 0.6, 0.8, 0.9])
 def test_blocks_hold_out_the_share_that_was_asked_for(fraction):
     scene = make_split(flights(40, 2), SplitSettings("blocked", fraction=fraction)).scene
