@@ -17,12 +17,11 @@ from chronoscene.synth.render import shade
 
 SCRIPT = """
 import torch
-from chronoscene.training.optimizers.adam import adam_block
-from chronoscene.training.optimizers.adam import Adam
+from chronoscene.training.optimizers.adam import Adam, adam_tensors_alone
 value = torch.ones(40, requires_grad=True)
 value.grad = torch.ones(40)
 Adam({"x": value}).step({"x": 0.5})
-print(float(value.sum()), sum(adam_block.stats.cache_hits.values()))
+print(float(value.sum()), sum(adam_tensors_alone.stats.cache_hits.values()))
 """
 
 
