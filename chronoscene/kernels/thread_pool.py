@@ -241,8 +241,8 @@ if hasattr(os, "register_at_fork"):
 def _stop_all() -> None:
     """End all threads before the interpreter goes.
 
-    It ends them while they wait for its lock, by unwinding their stacks; where these have frames of
-    C++ that allow no exceptions, the process aborts.
+    The interpreter would unwind the stacks of threads that wait for its lock, and the process
+    aborts if there is a frame of C++ that allows no exceptions.
     """
     for pool in (_pool, *_spare):
         pool.stop()

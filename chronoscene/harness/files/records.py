@@ -383,18 +383,6 @@ def _is_final(folder: Path) -> bool:
     return folder.name.removeprefix("seed").isdigit()
 
 
-def damaged_runs(runs: Path) -> dict[Path, str]:
-    """Return the finished runs below a folder that `write_summary` cannot read, and why."""
-    found = {}
-    for folder in run_folders(runs):
-        try:
-            read_run(folder)
-            read_text(folder / ROWS_FILE, error=CheckpointError)
-        except CheckpointError as error:
-            found[folder] = str(error)
-    return found
-
-
 def write_summary(runs: Path, without: Collection[Path] = ()) -> list[RunRecord]:
     """Write ``results.json`` and ``rows.csv`` of all finished runs below a folder.
 
@@ -422,3 +410,17 @@ def write_summary(runs: Path, without: Collection[Path] = ()) -> list[RunRecord]
             lines += rows.splitlines(keepends=True)[1:]
         write_text_atomic(runs / ROWS_FILE, "".join(lines))
     return records
+
+
+def write_summary_of_readable(runs: Path) -> dict[Path, str]:
+    """Write the summary without damaged runs, none if there is no other; return why they are."""
+    folders, damaged = run_folders(runs), {}
+    for folder in folders:
+        try:
+            read_run(folder)
+            read_text(folder / ROWS_FILE, error=CheckpointError)
+        except CheckpointError as error:
+            damaged[folder] = str(error)
+    if len(damaged) < len(folders):
+        write_summary(runs, without=damaged)
+    return damaged

@@ -113,18 +113,10 @@ def run_plan(
             else:
                 _run_in_pool(todo, log, pool, carry_out)
     finally:
-        _write_summary(settings.run.runs, log)
+        for reason in records.write_summary_of_readable(settings.run.runs).values():
+            log(f"left out of {records.RESULTS_FILE}: {reason}")
     finished = tuple(folder for folder in plan.runs if (folder / records.RUN_FILE).is_file())
     return BenchOutcome(finished, len(plan.runs) - len(todo), tuple(failures))
-
-
-def _write_summary(runs: Path, log: Log) -> None:
-    """Write the summary of all runs of the folder but damaged ones; none if there are none."""
-    damaged = records.damaged_runs(runs)
-    for reason in damaged.values():
-        log(f"left out of {records.RESULTS_FILE}: {reason}")
-    if len(damaged) < len(records.run_folders(runs)):
-        records.write_summary(runs, without=damaged)
 
 
 def _run_in_pool(

@@ -29,7 +29,7 @@ from chronoscene.harness.files.records import (
     read_with_rows,
     run_folders,
     write_run,
-    write_summary,
+    write_summary_of_readable,
 )
 from chronoscene.harness.files.strategies import period_part
 from chronoscene.harness.plan.job import Job
@@ -329,7 +329,6 @@ def rescore(
     if not folders:
         raise no_runs(runs, "no finished run in it")
     outcomes: list[Rescored] = []
-    damaged = []
     for folder in folders:
         if progress is not None:
             progress(len(outcomes), len(folders))
@@ -337,13 +336,9 @@ def rescore(
             record = read_run(folder)
         except CheckpointError as error:
             outcomes.append(Rescored(folder, [], [], str(error)))
-            damaged.append(folder)
             continue
         outcomes.append(_rescore_one(runs, folder, record, scorers))
-        if not (folder / ROWS_FILE).is_file():
-            damaged.append(folder)
-    if len(damaged) < len(folders):
-        write_summary(runs, without=damaged)
+    write_summary_of_readable(runs)
     return outcomes
 
 
