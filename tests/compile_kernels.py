@@ -5,11 +5,16 @@ python -m tests.compile_kernels [--scene] METHOD...
 
 import argparse
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
+from chronoscene.harness.contract.tiny_training import small_config
 from chronoscene.harness.train.warm_up import warm_up
-from chronoscene.methods import import_object, load_spec
+from chronoscene.methods import load_spec
 from chronoscene.synth import generate, preset
+
+OPTIONS = {"exposure": "image", "depth_weight": 0.1, "period_decay": 0.1}
+"""What has kernels of its own."""
 
 parser = argparse.ArgumentParser()
 parser.add_argument("methods", nargs="*")
@@ -20,6 +25,8 @@ if arguments.scene:
         generate(Path(folder) / "scene", preset("tiny", views=4))
 for name in arguments.methods:
     spec = load_spec(name)
-    config = import_object(spec.config)()
-    if notice := warm_up(spec, config, num_periods=2, device="cpu"):
-        raise SystemExit(f"{name}: {notice}")
+    config = small_config(spec)
+    known = {k: v for k, v in OPTIONS.items() if hasattr(config, k)}
+    for config in (config, replace(config, **known)):
+        if notice := warm_up(spec, config, num_periods=2, device="cpu"):
+            raise SystemExit(f"{name}: {notice}")

@@ -66,6 +66,12 @@ def write_model(model: pycolmap.Reconstruction, folder: Path, form: str) -> None
         (folder / "frames.bin").unlink()
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Small scenes are quicker on one thread, most of all beside other tests."""
+    runtime.set_threads(1)
+
+
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """Make a folder that costs seconds once for all processes of the tests; do not change it."""
@@ -88,7 +94,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
+def threads() -> Callable[[int], None]:
     """Sets how many threads kernels have; the test is skipped where there are not so many."""
     import numba
 
@@ -97,17 +103,7 @@ def threads() -> Iterator[Callable[[int], None]]:
             pytest.skip(f"needs {number} threads")
         numba.set_num_threads(number)
 
-    before = numba.get_num_threads()
-    yield set_threads
-    numba.set_num_threads(before)
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Small scenes are quicker on one thread, most of all beside other work."""
-    runtime.set_threads(1)
-    yield
-    runtime.set_threads()
+    return set_threads
 
 
 @pytest.fixture

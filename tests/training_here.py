@@ -10,16 +10,12 @@ from chronoscene.harness.files.records import Failure
 from chronoscene.harness.plan.job import Job
 from chronoscene.harness.run.process import put_in_place, staged
 from chronoscene.harness.train.worker import execute
-from chronoscene.kernels.runtime import set_threads
 
 
 def execute_here(job: Job) -> Failure | None:
     """A job in this process, which costs no time to start."""
     with staged(job) as job:
-        try:
-            execute(job.document(), lambda *progress: None)
-        finally:
-            set_threads(None)
+        execute(job.document(), lambda *progress: None)
     return put_in_place(job, Path(job.staging))
 
 

@@ -28,8 +28,6 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.checkpoint import load_tensors
 from chronoscene.training.drawing import Splats, draw
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STEPS = 100
 
 

@@ -23,8 +23,6 @@ from chronoscene.errors import ConfigError
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import TrainingSet, build_config
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def config(**changes: Any) -> Deformation4DGSConfig:
     """The preset for short trainings, made for the toy scene."""

@@ -15,8 +15,6 @@ from chronoscene.errors import ShapeError
 from chronoscene.gaussians.model import SHAPES
 from chronoscene.kernels.runtime import set_threads
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 # Worst of 200 random problems against float64, relative to the largest number of a tensor (or to
 # `SMALL`, where sums cancel): values 1.3e-6, gradients 5.2e-6.
 VALUE_TOLERANCE = 5e-6

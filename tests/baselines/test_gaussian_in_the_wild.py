@@ -31,8 +31,6 @@ from chronoscene.methods import TrainingSet, View, build_config
 from chronoscene.training.photometric import photometric_loss_reference
 from chronoscene.training.views import PhotosOnDevice
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def config(**changes: Any) -> GaussianInTheWildConfig:
     """The preset for short trainings, made for the toy scene."""

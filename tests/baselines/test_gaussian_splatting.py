@@ -14,8 +14,6 @@ from chronoscene.gaussians.trainer import Timeline
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def test_it_learns_a_static_scene():
     scene = toy_scene(count=150)

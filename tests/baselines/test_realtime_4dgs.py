@@ -33,8 +33,6 @@ from chronoscene.methods import TrainingSet, build_config
 from chronoscene.training.checkpoint import load_tensors, save_tensors
 from chronoscene.training.drawing import draw
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def config(**changes: Any) -> Realtime4DGSConfig:
     """The preset for short trainings, made for the toy scene."""

@@ -15,8 +15,6 @@ from chronoscene.gaussians.model import axes_of, opacities_of
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.scene.geometry import rotation_from_quaternion
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 TIME, CYCLE = 0.4, 1.3
 
 # Worst of 120 random problems, relative to the largest number of a tensor or to 1, whichever is

@@ -173,7 +173,6 @@ def test_a_maximum_must_be_given():
 
 
 def test_regularisers_make_gaussians_fainter_and_smaller():
-    set_threads(1)
     scene, means = toy_scene(), []
     config = replace(SHORT, iterations=60, densification="mcmc", mcmc_noise=0.0, mcmc_growth=0.0)
     for weight in (0.0, 1.0):
@@ -181,18 +180,15 @@ def test_regularisers_make_gaussians_fainter_and_smaller():
         parameters = train(scene, replace(config, **weights)).model.parameters
         opacity = opacities_of(parameters["logit_opacities"].detach()).mean()
         means.append((float(opacity), float(scales_of(parameters["log_scales"].detach()).mean())))
-    set_threads()
     assert means[1][0] < 0.9 * means[0][0] and means[1][1] < 0.9 * means[0][1]
 
 
 def test_it_learns_a_static_scene():
-    set_threads(1)
     scene = toy_scene(count=150)
     config = replace(SHORT, densification="mcmc", iterations=300, mcmc_growth=0.2)
     start = GaussianSplatting(config)
     start.setup(scene, seed=0, device="cpu")
     method = train(scene, config)
-    set_threads()
     assert 150 < len(method.model) <= config.max_gaussians
     assert mean_squared_error(method, scene) < 0.2 * mean_squared_error(start, scene)
 
@@ -206,5 +202,4 @@ def test_equal_seeds_give_equal_bits_for_any_number_of_threads():
     for threads, seed in ((1, 0), (2, 0), (2, 1)):
         set_threads(threads)
         found.append(train(scene, config, seed=seed).model.parameters["means"].detach())
-    set_threads()
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 
 import numba
 import pytest
@@ -13,12 +12,6 @@ from chronoscene.kernels import side_by_side as module
 from chronoscene.kernels.runtime import available_threads, set_threads
 from chronoscene.kernels.side_by_side import side_by_side
 from chronoscene.kernels.thread_pool import launch
-
-
-@pytest.fixture(autouse=True)
-def all_threads() -> Iterator[None]:
-    yield
-    set_threads()
 
 
 def look(item: int) -> tuple[int, int, int]:

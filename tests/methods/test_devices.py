@@ -64,13 +64,10 @@ def depth_in_every_step() -> Iterator[None]:
 
 
 @pytest.fixture
-def two_threads() -> Iterator[None]:
+def two_threads() -> None:
     """Sums of torch have other bits on one processor: a Gaussian of 4dgs ends so close to the
     opacity below which none is drawn that only one of both ways draws it."""
-    before = torch.get_num_threads()
     torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
 
 
 @dataclass

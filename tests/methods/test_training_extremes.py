@@ -6,8 +6,6 @@ import pytest
 
 from chronoscene.methods import load_spec, method_names
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 CHEAP = [e for e in extreme_trainings.EXTREMES[1:] if e.cheap]
 
 

@@ -15,8 +15,6 @@ from chronoscene.training import sparse_depth
 from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.views import downscale_view
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STEPS = 30
 
 GAUSSIANS = ["4dgs", "realtime4dgs", "gs-w", "cl-splats"]

@@ -18,6 +18,7 @@ from numba import njit
 from rasterizer_cases.comparison import everything
 from rasterizer_cases.scenes import NAMES
 
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.kernels.thread_pool import launch
 from chronoscene.rasterizer import rasterize
 from chronoscene.rasterizer.cpu import layout, passes
@@ -172,6 +173,7 @@ def test_sort_is_stable_and_leaves_out_negative_keys(keys: np.ndarray, parts: in
     def kernel(worker: int, control: np.ndarray) -> None:
         in_spare.append(_sort(control, keys, counts, pairs, spare, result)[1])
 
+    set_threads(2)
     launch(kernel, 2, phases=SORT_PHASES)
     order = (spare if in_spare[0] else pairs)[: result[0]] & 0xFFFFFFFF
     expected = np.argsort(keys, kind="stable")

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 import pytest
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.harness.files.provenance import scene_hash
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.synth import generate, preset
 from chronoscene.validation.run import validate_scene
 
@@ -31,18 +31,17 @@ def files(folder: Path) -> list[Path]:
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("small") / "two"
+    set_threads()
     generate(folder, preset("tiny", **SMALL))
     return folder
 
 
 def test_same_seed_same_bytes_with_one_thread(small: Path, tmp_path: Path) -> None:
-    threads, cores = numba.get_num_threads(), os.sched_getaffinity(0)
+    cores = os.sched_getaffinity(0)
     try:
-        numba.set_num_threads(1)
         os.sched_setaffinity(0, {min(cores)})
         generate(tmp_path / "one", preset("tiny", **SMALL))
     finally:
-        numba.set_num_threads(threads)
         os.sched_setaffinity(0, cores)
     names = files(small)
     assert names == files(tmp_path / "one")

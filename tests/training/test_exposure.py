@@ -165,7 +165,6 @@ def wall_of(gains):
 
 def test_static_gaussians_show_periods_as_bright_as_their_photos(tmp_path):
     """Here the period decides on nothing but the exposure."""
-    set_threads(1)
     scene = wall_of((1.0, 0.6))
     config = GaussianConfig(
         iterations=150, stretch=True, densify_from=30_000, reset_interval=30_000
@@ -178,7 +177,6 @@ def test_static_gaussians_show_periods_as_bright_as_their_photos(tmp_path):
             method.step(i, i / config.iterations)
         shown = [method.render(scene.views[p], p).rgb for p in (0, 1)]
         errors[kind] = np.mean([np.abs(shown[p] - scene.load_image(p) / 255) for p in (0, 1)])
-    set_threads()
     assert errors["image"] < 0.5 * errors["none"] and errors["period"] < 0.5 * errors["none"]
     method.save(tmp_path)
     loaded = GaussianSplatting(config)

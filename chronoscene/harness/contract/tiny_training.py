@@ -99,11 +99,14 @@ def train(
     data: TrainingSet,
     *,
     seed: int = 0,
-    threads: int | None = None,
+    threads: int = 1,
     steps: int = STEPS,
     probe: bool = False,
 ) -> tuple[Method, list[StepReport]]:
-    """Train as the harness does; ``probe`` renders now and then in between."""
+    """Train as the harness does; ``probe`` renders now and then in between.
+
+    So small a scene is quicker on one thread.
+    """
     set_threads(threads)
     seed_everything(seed)
     method = make_method(spec, small_config(spec))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from numba import get_num_threads
 
 from benchmarks.training.generated import PROGRESS, make, training_set
 from benchmarks.training.gpu_trace import summary
 from benchmarks.training.scaling import ROUND, measure_scaling, parallel_share, print_scaling
 from benchmarks.training.step import GPU_PARTS, PARTS, measure
-from chronoscene.kernels.runtime import set_threads
 from chronoscene.training import devices
 
 
@@ -49,13 +47,9 @@ def test_the_parallel_share_of_a_part() -> None:
 
 @pytest.mark.parametrize("name", ["chronogs", "3dgs"])
 def test_parts_of_a_step_by_threads(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    threads = get_num_threads()
-    try:
-        found = measure_scaling(
-            name, 200, (24, 16), preset="fast", threads=(1, 2), steps=1, measure=measure
-        )
-    finally:
-        set_threads(threads)
+    found = measure_scaling(
+        name, 200, (24, 16), preset="fast", threads=(1, 2), steps=1, measure=measure
+    )
     print_scaling("title", found, tuple(dict.fromkeys(part for part, _, _ in PARTS)))
     lines = capsys.readouterr().out.splitlines()
     assert lines[1] == "title" and lines[2].split()[-2:] == ["parallel,", "2"]
