@@ -25,8 +25,8 @@ if arguments.scene:
         generate(Path(folder) / "scene", preset("tiny", views=4))
 for name in arguments.methods:
     spec = load_spec(name)
-    config = small_config(spec)
-    known = {k: v for k, v in OPTIONS.items() if hasattr(config, k)}
-    for config in (config, replace(config, **known)):
+    plain = small_config(spec)
+    known = {k: v for k, v in OPTIONS.items() if hasattr(plain, k)}
+    for config in (plain, replace(plain, **known)):
         if notice := warm_up(spec, config, num_periods=2, device="cpu"):
             raise SystemExit(f"{name}: {notice}")

@@ -195,7 +195,9 @@ def test_where_nothing_changes_no_anchor_keeps_a_block_of_its_own() -> None:
     check_sharing(sharing, made.size(), "sharing")
 
 
-@pytest.mark.parametrize(("periods", "decay"), [((1, 1), 3.0), ((0, 1), 0.3)])
+@pytest.mark.parametrize(
+    ("periods", "decay"), [((1, 1), 3.0), pytest.param((0, 1), 0.3, marks=pytest.mark.slow)]
+)
 def test_a_decay_makes_periods_alike_where_their_photos_are(
     periods: tuple[int, int], decay: float
 ) -> None:

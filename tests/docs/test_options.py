@@ -8,7 +8,7 @@ import click
 import pytest
 
 from chronoscene.cli import COMMANDS, cli
-from chronoscene.methods import MethodSpec, installed_methods, load_spec, options_of
+from chronoscene.methods import installed_methods, load_spec, options_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = subprocess.run(
@@ -31,9 +31,11 @@ def command_options() -> dict[str, set[str]]:
 
 
 @pytest.fixture(scope="module")
-def specs() -> list[MethodSpec]:
-    """Of the installed methods."""
-    return [load_spec(name) for name in installed_methods()]
+def known() -> tuple[set[str], set[str]]:
+    """Options and presets of the installed methods."""
+    specs = [load_spec(name) for name in installed_methods()]
+    options = {option.name for spec in specs for option in options_of(spec)}
+    return options, {preset for spec in specs for preset in spec.presets}
 
 
 @pytest.mark.parametrize("page", MARKDOWN)
@@ -46,14 +48,10 @@ def test_options_of_commands_exist(page: str, command_options: dict[str, set[str
 
 
 @pytest.mark.parametrize("page", MARKDOWN)
-def test_options_and_presets_exist(page: str, specs: list[MethodSpec]) -> None:
+def test_options_and_presets_exist(page: str, known: tuple[set[str], set[str]]) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     options = {name.rpartition(".")[2] for name in re.findall(r"--set\s+'?([\w.-]+)=", text)}
-    assert options - {"NAME", "METHOD.NAME", "key", "KEY"} <= {
-        option.name for spec in specs for option in options_of(spec)
-    }
+    assert options - {"NAME", "METHOD.NAME", "key", "KEY"} <= known[0]
     named = re.findall(r"--preset\s+([\w./-]+)", text)
     presets = {name.rstrip(".") for name in named if not name.endswith(".toml")}
-    assert presets - {"NAME", "TEXT", "demo"} <= {  # The demo scene is a preset of synth
-        preset for spec in specs for preset in spec.presets
-    }
+    assert presets - {"NAME", "TEXT", "demo"} <= known[1]  # The demo scene is a preset of synth

@@ -8,6 +8,7 @@ from chronoscene.methods import load_spec, method_names
 
 CHEAP = [e for e in extreme_trainings.EXTREMES[1:] if e.cheap]
 
+SLOW = {n for n in method_names() if load_spec(n).mixes_views} | {"gs-w"}
 
 SHARE = 9
 """Pairs of extreme and method of which one is tested by default: each method meets a share
@@ -17,7 +18,7 @@ of the extremes, each extreme a share of the methods."""
 def pairs():
     for i, extreme in enumerate(CHEAP):
         for j, name in enumerate(method_names()):
-            quick = (i + j) % SHARE == 0 and not load_spec(name).mixes_views
+            quick = (i + j) % SHARE == 0 and name not in SLOW
             marks = () if quick else pytest.mark.slow
             yield pytest.param(extreme, name, id=f"{extreme.name}-{name}", marks=marks)
 

@@ -86,15 +86,22 @@ def files_of(folder):
     return {n: p.name in timed or p.read_bytes() for n, p in files.items()}
 
 
-def test_results_are_those_of_a_local_run(on_ray, scene_folder, tmp_path):
-    names = {"methods": ("toy_methods:DRAWING", "3dgs"), "iterations": 12, "keep_training": True}
+@pytest.mark.parametrize(
+    "methods",
+    [
+        ("toy_methods:DRAWING",),
+        pytest.param(("toy_methods:DRAWING", "3dgs"), marks=pytest.mark.slow),
+    ],
+)
+def test_results_are_those_of_a_local_run(on_ray, scene_folder, tmp_path, methods):
+    names = {"methods": methods, "iterations": 12, "keep_training": True}
     outcome, said = on_ray(**names)
     assert outcome.failures == ()
-    assert sum(" seed 0: on " in line for line in said) == 2
+    assert sum(" seed 0: on " in line for line in said) == len(methods)
     assert not list(tmp_path.rglob("*.partial")) and not list(tmp_path.rglob("*.token"))
     local = {"scenes": (scene_folder,), "runs": tmp_path / "local", "threads": 1}
     for found in outcome.finished:
-        method = names["methods"]["3dgs" in found.parent.name]
+        method = methods["3dgs" in found.parent.name]
         (one,) = run_bench(
             bench_settings(**local, **{**names, "methods": (method,)}),
             lambda line: None,
@@ -103,7 +110,7 @@ def test_results_are_those_of_a_local_run(on_ray, scene_folder, tmp_path):
         assert files_of(found) == files_of(one)
         ours, theirs = read_run(one), read_run(found)
         assert theirs.aggregates == ours.aggregates and theirs.commit == ours.commit
-    begun = {**names, "methods": names["methods"][:1], "iterations": None}
+    begun = {**names, "methods": methods[:1], "iterations": None}
     longer, _ = on_ray(**begun, continue_to=20)
     assert longer.failures == () and read_run(longer.finished[0]).iterations == 20
 

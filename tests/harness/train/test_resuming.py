@@ -80,7 +80,10 @@ def kill_later(process, runs, seconds, part="all"):
     return process.returncode == -signal.SIGKILL
 
 
-@pytest.mark.parametrize(("strategy", "part"), [("joint", "all"), ("sequential", "period-1")])
+@pytest.mark.parametrize(
+    ("strategy", "part"),
+    [pytest.param("joint", "all", marks=pytest.mark.slow), ("sequential", "period-1")],
+)
 def test_a_killed_training_ends_as_an_undisturbed_one(
     bench_here, scene_folder, tmp_path, strategy, part
 ):

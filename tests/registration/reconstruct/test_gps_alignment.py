@@ -205,7 +205,10 @@ def test_a_scale_known_to_nine_percent_is_no_metre(make_scene_folder: Callable[.
     assert any("not accurate enough for metres" in r for r in remarks)
 
 
-@pytest.mark.parametrize("height_noise", [1.0, 30.0])  # the latter leaves heights out
+@pytest.mark.parametrize(
+    "height_noise",
+    [1.0, pytest.param(30.0, marks=pytest.mark.slow)],  # the latter leaves heights out
+)
 def test_the_stated_error_of_the_scale_is_that_of_repeated_flights(height_noise: float) -> None:
     rng = np.random.default_rng(15)
     world = flight(rng)
