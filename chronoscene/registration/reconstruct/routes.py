@@ -116,7 +116,7 @@ def _merged(
         combined = combine(submodels, matches, priors, task.database, keep_unplaced=keep_unplaced)
         task.remarks.extend(combined.remarks)
         model = _adjusted_in_rounds(combined.model, task)
-    if not keep_unplaced:  # periods that wait for tie points would contradict the others
+    if not combined.unplaced:  # periods that wait for tie points would contradict the others
         model = _settled(model, matches, len(arguments["periods"]), task)
         model = rejoined(model, matches, priors, task)
     if arguments.get("full_lens", False):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from chronoscene.errors import RegistrationError
+from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.reconstruct.routes import add_period, joint, separate
 from chronoscene.scene.geometry import camera_centre
 
@@ -115,6 +116,24 @@ def test_nothing_to_map_is_said(make_case: Callable[..., Any]) -> None:
     case.extra["keep_unplaced"] = True
     with pytest.raises(RegistrationError, match="tie points align models"):
         case.run(separate)
+
+
+@pytest.mark.parametrize("keep_unplaced", [False, True])
+def test_a_photo_that_only_the_other_period_matches_is_registered(
+    make_case: Callable[..., Any], keep_unplaced: bool
+) -> None:
+    """With tie points, too, as long as no period waits for them."""
+    case = make_case()
+    case.extra["keep_unplaced"] = keep_unplaced
+    with pycolmap.Database.open(str(case.database)) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        lone, *others = sorted(n for n, p in case.periods.items() if p == 1)
+        for other in others:
+            database.delete_two_view_geometry(ids[lone], ids[other])
+    result = case.run(separate)
+    assert any("1 more images registered with the merged model" in r for r in result["remarks"])
+    assert result["model"]["images"] == len(case.truth)
+    assert_accurate(case)
 
 
 def test_a_period_without_matches_waits_for_tie_points(make_case: Callable[..., Any]) -> None:
