@@ -291,9 +291,10 @@ def survey_scene(scene: Scene, folder: Path, options: SurveyOptions) -> dict[str
 
 
 def _spacing(xyz: Array) -> float:
-    """Median distance of points to their nearest other; 1 without any."""
+    """Median distance of points to their nearest other place; 1 without any."""
     from scipy.spatial import cKDTree
 
+    xyz = np.unique(xyz, axis=0)
     return float(np.median(cKDTree(xyz).query(xyz, 2)[0][:, 1])) if len(xyz) > 1 else 1.0
 
 

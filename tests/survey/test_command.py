@@ -160,17 +160,20 @@ def test_points_that_are_not_finite_are_left_out(site, tmp_path, kind):
         assert sum(p["points"] for p in periods) == len(toy.found.points) - 3
 
 
-def test_distances_between_dense_sparse_points(tmp_path):
+@pytest.mark.parametrize("copies", [1, 3])
+def test_distances_between_dense_sparse_points(tmp_path, copies):
     """The points of each period lie in a plane of their own, 0.5 m apart in a quarter of it."""
     made = make_scene(tmp_path)
     east, north = np.meshgrid(np.arange(40) / 4, np.arange(40) / 4)
     planes = [np.stack([east, north, np.full_like(east, 0.0)], axis=-1).reshape(-1, 3)] * 2
     planes[1] = planes[1] + [0, 0, 0.5] * ((planes[1] > 5)[:, :2].all(axis=1)[:, None])
+    rng = np.random.default_rng(0)
+    planes = [np.repeat(p + rng.normal(0, 1e-3, p.shape), copies, axis=0) for p in planes]
     count = len(planes[0])
     points = replace(
         made.points,
         ids=np.arange(1, 2 * count + 1),
-        xyz=np.concatenate(planes) + np.random.default_rng(0).normal(0, 1e-3, (2 * count, 3)),
+        xyz=np.concatenate(planes),
         rgb=np.zeros((2 * count, 3), np.uint8),
         error=np.zeros(2 * count),
         track_start=2 * np.arange(2 * count + 1),

@@ -93,8 +93,8 @@ def _or_separate(
         return joint
     context.stages.remark(
         "route",
-        f"the joint model has {shares[worst]:.0%} of the photos of period {worst}: the separate "
-        "route is tried too",
+        f"the joint model has {shares[worst]:.0%} of the photos of {inputs.labels[worst]}: the "
+        "separate route is tried too",
     )
     try:
         other = _run_route("separate", inputs, matched, context)
