@@ -77,7 +77,9 @@ def _register_lanes() -> int:
 LANES = _register_lanes()  # Numbers of 32 bits in the widest register of the processor
 BYTE_PRODUCTS = LANES == 16 and "+avx512vnni" in _features()
 """True if the processor has `emit_add_byte_products`."""
-MANY_REGISTERS = LANES == 16 or platform.machine() in ("aarch64", "arm64")
+_IS_ARM = platform.machine() in ("aarch64", "arm64")
+FUSED = _IS_ARM or "+fma" in _features()  # True if `multiply_add` rounds once
+MANY_REGISTERS = LANES == 16 or _IS_ARM
 """32 vector registers, else 16."""
 
 FLOAT = ir.FloatType()

@@ -17,6 +17,7 @@ from chronoscene.kernels.thread_pool import draw
 from chronoscene.kernels.transposes import store_pixels
 from chronoscene.kernels.vector_math import ROUNDER, exp2
 from chronoscene.kernels.vectors import (
+    FUSED,
     any_lane,
     make_constant,
     minimum,
@@ -147,6 +148,18 @@ def _any_light(state, at):
     return found
 
 
+@inlined
+def _light_left(alpha: Any, light: Any) -> Any:
+    """Return (1 - alpha) light, in one rounding or in two small ones.
+
+    The rounding of light - alpha light is that of the light before, which may be 1000 times what is
+    left.
+    """
+    if FUSED:
+        return multiply_add(0.0 - alpha, light, light)
+    return (1.0 - alpha) * light
+
+
 @inner(fast_math=True)
 def _forward_tile(start, end, left, top, active, plane, entries, records, planes, state):
     """Composite the entries of a tile: C += alpha T c, T *= 1 - alpha. Returns where it stopped.
@@ -179,9 +192,7 @@ def _forward_tile(start, end, left, top, active, plane, entries, records, planes
                 counts = power >= layout.LEVEL_MIN
                 light = load(state, at)
                 weight = select(counts, alpha * light, 0.0)
-                # Not light - weight: its rounding is that of the light before, which may be 1000
-                # times what is left.
-                after = select(counts, multiply_add(0.0 - alpha, light, light), light)
+                after = select(counts, _light_left(alpha, light), light)
                 ending = (light > 0.0) & (after <= constants.TRANSMITTANCE_MIN)
                 if any_lane(ending):
                     weight = select(ending, 0.0, weight)
