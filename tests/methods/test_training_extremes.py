@@ -11,8 +11,8 @@ CHEAP = [e for e in extreme_trainings.EXTREMES[1:] if e.cheap]
 SLOW = {n for n in method_names() if load_spec(n).mixes_views} | {"gs-w"}
 
 SHARE = 9
-"""Pairs of extreme and method of which one is tested by default: each method meets a share
-of the extremes, each extreme a share of the methods."""
+"""Pairs of extreme and method of which one is tested by default: each method that is not slow
+meets a share of the extremes, each extreme a share of the methods."""
 
 
 def pairs():
