@@ -14,7 +14,7 @@ from chronoscene.methods import load_spec
 from chronoscene.synth import generate, preset
 
 OPTIONS = {"exposure": "image", "depth_weight": 0.1, "period_decay": 0.1}
-"""What has kernels of its own."""
+"""Options that have kernels of their own."""
 
 parser = argparse.ArgumentParser()
 parser.add_argument("methods", nargs="*")

@@ -49,9 +49,10 @@ def test_options_of_commands_exist(page: str, command_options: dict[str, set[str
 
 @pytest.mark.parametrize("page", MARKDOWN)
 def test_options_and_presets_exist(page: str, known: tuple[set[str], set[str]]) -> None:
+    known_options, known_presets = known
     text = (ROOT / page).read_text(encoding="utf-8")
     options = {name.rpartition(".")[2] for name in re.findall(r"--set\s+'?([\w.-]+)=", text)}
-    assert options - {"NAME", "METHOD.NAME", "key", "KEY"} <= known[0]
+    assert options - {"NAME", "METHOD.NAME", "key", "KEY"} <= known_options
     named = re.findall(r"--preset\s+([\w./-]+)", text)
     presets = {name.rstrip(".") for name in named if not name.endswith(".toml")}
-    assert presets - {"NAME", "TEXT", "demo"} <= known[1]  # The demo scene is a preset of synth
+    assert presets - {"NAME", "TEXT", "demo"} <= known_presets  # "demo" is one of synth

@@ -106,14 +106,15 @@ def _merged(
             f"{also if arguments['keep_unplaced'] else ''}",
         )
     _, matches = verified_matches(task.database)
-    priors, keep_unplaced = Priors.of(arguments["priors"]), arguments["keep_unplaced"]
+    priors = Priors.of(arguments["priors"])
     if len(submodels) == 1:
         combined = Combined(submodels[0].model, (), (), ())
         model = combined.model
         adjust(model, task)
     else:
         task.report("aligning", 0, 1)
-        combined = combine(submodels, matches, priors, task.database, keep_unplaced=keep_unplaced)
+        keep = arguments["keep_unplaced"]
+        combined = combine(submodels, matches, priors, task.database, keep_unplaced=keep)
         task.remarks.extend(combined.remarks)
         model = _adjusted_in_rounds(combined.model, task)
     if not combined.unplaced:  # periods that wait for tie points would contradict the others
