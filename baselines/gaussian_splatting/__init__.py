@@ -46,12 +46,15 @@ SPEC = MethodSpec(
     },
 )
 
+_PERIOD_PRESETS = {name: {"exposure": "period", **values} for name, values in _PRESETS.items()}
+_PERIOD_PRESETS["balanced"]["depth_weight"] = 0.1
+
 PERIOD_SPEC = replace(
     SPEC,
     name="3dgs-period",
     title="3DGS, period exposure",
     period_input="continuous",
     method="baselines.gaussian_splatting.method:GaussianSplattingPeriod",
-    presets={name: {"exposure": "period", **values} for name, values in _PRESETS.items()},
+    presets=_PERIOD_PRESETS,
 )
 """The least that time can be to 3DGS: a transform of the colours of each period."""
