@@ -53,6 +53,24 @@ class OneOfSeveral(click.types.StringParamType):
         return text
 
 
+class ImageSize(click.ParamType):
+    """Width and height of images in pixels, such as ``320x240``."""
+
+    name = "widthxheight"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """Convert the text of an option."""
+        match = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", value.strip())
+        if match is None:
+            self.fail(f"expected WIDTHxHEIGHT, such as 320x240, found {value!r}", param, ctx)
+        return int(match[1]), int(match[2])
+
+
+IMAGE_SIZE = ImageSize()
+
+
 def _period_help() -> str:
     known = {name: getattr(it, "PERIOD_BY", ()) for name, it in formats_that_load().items()}
     rules = "; ".join(f"{name}: {', '.join(by)}" for name, by in known.items() if by)

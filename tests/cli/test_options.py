@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import COMMANDS, cli
-from chronoscene.cli.options import FiniteFloat, OneOfSeveral, refuse_options
+from chronoscene.cli.options import IMAGE_SIZE, FiniteFloat, OneOfSeveral, refuse_options
 from chronoscene.errors import ConfigError
 
 
@@ -67,3 +67,10 @@ def test_options_of_several_values_know_the_options():
     options = [option for name in COMMANDS for option in cli.get_command(context, name).params]
     several = [o for o in options if isinstance(o, click.Option) and o.nargs > 1]
     assert several and all(isinstance(option.type, OneOfSeveral) for option in several)
+
+
+def test_sizes_of_images():
+    assert IMAGE_SIZE.convert(" 320X240 ", None, None) == (320, 240)
+    for text in ("320", "-4x10", "4x10x3", "٣x٤", "4 x 10"):
+        with pytest.raises(click.BadParameter, match="expected WIDTHxHEIGHT, such as 320x240"):
+            IMAGE_SIZE.convert(text, None, None)

@@ -9,6 +9,7 @@ import click
 
 from chronoscene.cli.options import (
     DEVICE,
+    IMAGE_SIZE,
     PATH,
     PLUGIN,
     RUN,
@@ -21,13 +22,7 @@ from chronoscene.cli.options import (
 from chronoscene.cli.output import check_file, check_place, report_written
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
-from chronoscene.harness.use.cameras import (
-    LARGEST_SIDE,
-    VIEWS,
-    OrbitShape,
-    find_viewpoints,
-    with_periods,
-)
+from chronoscene.harness.use.cameras import VIEWS, OrbitShape, find_viewpoints, with_periods
 from chronoscene.harness.use.rendering import (
     check_viewpoints,
     is_animation,
@@ -36,21 +31,6 @@ from chronoscene.harness.use.rendering import (
 )
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.kernels.runtime import keep_freed_memory
-
-
-def parse_size(
-    ctx: click.Context, param: click.Parameter, value: str | None
-) -> tuple[int, int] | None:
-    """Parse ``WIDTHxHEIGHT``, as a click callback."""
-    if value is None:
-        return None
-    width, _, height = value.lower().partition("x")
-    if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
-        raise click.BadParameter(f"expected WIDTHxHEIGHT, such as 1280x720, found {value!r}")
-    size = int(width), int(height)
-    if not all(1 <= side <= LARGEST_SIDE for side in size):
-        raise click.BadParameter(f"expected sides from 1 to {LARGEST_SIDE} pixels, found {value!r}")
-    return size
 
 
 @click.command("render")
@@ -88,8 +68,8 @@ def parse_size(
 )
 @click.option(
     "--size",
+    type=IMAGE_SIZE,
     metavar="WIDTHxHEIGHT",
-    callback=parse_size,
     help="Pixels of the pictures of an orbit.  [default: the size of the evaluation]",
 )
 @click.option(

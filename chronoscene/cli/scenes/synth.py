@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 import click
 
-from chronoscene.cli.options import PATH
+from chronoscene.cli.options import IMAGE_SIZE, PATH
 from chronoscene.cli.output import say
 from chronoscene.cli.progress import progress_bar
-from chronoscene.errors import ConfigError
 from chronoscene.io.wording import counted
 from chronoscene.synth import PRESETS, generate, preset
 from chronoscene.synth.settings import KINDS
@@ -23,7 +21,9 @@ from chronoscene.synth.settings import KINDS
               help=f"Sizes: {', '.join(PRESETS)}.")  # fmt: skip
 @click.option("--periods", type=int, help="Number of dates of capture.")
 @click.option("--kind", help=f"Cameras: {', '.join(KINDS[:-1])}, or {KINDS[-1]} (close together).")
-@click.option("--size", metavar="WxH", help="Size of the images in pixels.")
+@click.option(
+    "--size", type=IMAGE_SIZE, metavar="WIDTHxHEIGHT", help="Size of the images in pixels."
+)
 @click.option(
     "--seed", type=int, help="Seed of the city; another one gives another city.  [default: 0]"
 )
@@ -35,7 +35,7 @@ from chronoscene.synth.settings import KINDS
               help="Sun, sky and season stay; only objects change.")  # fmt: skip
 @click.option("--off-centre/--centred", "off_centre", default=None,
               help="Principal point away from the image centre, or in it.")  # fmt: skip
-def command(out: Path, name: str, size: str | None, **changes: Any) -> None:
+def command(out: Path, name: str, size: tuple[int, int] | None, **changes: Any) -> None:
     """Generate a city photographed at several dates.
 
     OUT is a new folder in the ChronoScene format; OUT/gt has depth, change masks and the test views
@@ -43,25 +43,8 @@ def command(out: Path, name: str, size: str | None, **changes: Any) -> None:
     """
     given = {key: value for key, value in changes.items() if value is not None}
     if size is not None:
-        given["width"], given["height"] = parse_size(size)
+        given["width"], given["height"] = size
     settings = preset(name, **given)
     with progress_bar() as bar:
         generate(out, settings, bar)
     say(f"{out}: {counted(settings.periods, 'period')}, seed {settings.seed}")
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Width and height of ``320x240``.
-
-    Raises:
-        ConfigError: If the text has another form.
-    """
-    match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text.strip())
-    if match is None:
-        raise ConfigError(
-            "--size",
-            expected="width x height in pixels, such as 320x240",
-            found=repr(text),
-            todo="give two numbers with an x between them",
-        )
-    return int(match[1]), int(match[2])

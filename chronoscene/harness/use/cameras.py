@@ -71,6 +71,15 @@ class OrbitShape:
     height: float | None = None
     """Height above the middle of the points, in units of the scene."""
 
+    def __post_init__(self) -> None:
+        if self.size is not None and not all(1 <= side <= LARGEST_SIDE for side in self.size):
+            raise ConfigError(
+                "--size",
+                expected=f"sides from 1 to {LARGEST_SIDE} pixels",
+                found="{} x {}".format(*self.size),
+                todo="choose another size",
+            )
+
 
 def find_viewpoints(
     source: str,

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from command_line import invoke
 
-from chronoscene.cli.scenes.synth import parse_size
 from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 from chronoscene.formats import chronoscene as scene_format
 
@@ -38,9 +37,7 @@ def test_says_what_it_made(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("option", "place"),
     [
-        (["--size", "320"], "--size"),
         (["--size", "0x10"], "--size: expected a value from 16 to 8192, found 0"),
-        (["--size", "-4x10"], "--size"),
         (["--preset", "huge"], "--preset"),
         (["--periods", "0"], "--periods"),
         (["--kind", "orbital"], "--kind"),
@@ -65,7 +62,3 @@ def test_a_place_that_is_a_file(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ChronoSceneError):
         call(str(tmp_path / "file" / "scene"), "--preset", "tiny")
-
-
-def test_size() -> None:
-    assert parse_size("320x240") == parse_size(" 320X240 ") == (320, 240)

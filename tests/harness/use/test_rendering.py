@@ -81,6 +81,7 @@ def test_methods_without_geometry_of_their_own_refuse_another_light(runs, traine
         (("--period", "0:0.5"), "period 0.5: expected a whole number: 4DGS under strategy sep"),
         (("--cameras", "orbit"), "--period: expected a period"),
         (("--radius", 3), "--size, --radius, --height: expected --cameras orbit"),
+        (("--cameras", "orbit", "--size", "0x9"), "--size: expected sides from 1 to 16384 pixels"),
         (("--cameras", "orbit", "--radius", 1e300), "--radius: expected at most 1e.12 units"),
         (("--cameras", "orbit", "--height", -1e308), "--height: .* of the scene, found -1e.308;"),
         (("--frames", 5), "--frames: expected no such option where cameras and periods give"),
