@@ -71,7 +71,7 @@ def test_every_choice_trains_or_is_refused(
     spec = load_spec(name)
     steps, small = STEPS, {}
     if issubclass(import_object(spec.config), FieldConfig):
-        steps, small = FIELD_STEPS, SMALL_FIELD | {"samples": 2048}
+        steps, small = FIELD_STEPS, SMALL_FIELD | {"samples": 512}
         if value == "frequencies":  # refused beside options of a grid
             small = {name: small[name] for name in small if name not in GRID_OPTIONS}
     overrides = {"iterations": steps, **small, option: value}

@@ -86,7 +86,7 @@ class Compiled:
             "exposure": "image", "random_background": True, "depth_weight": 0.1
         }  # fmt: skip
         if isinstance(config, FieldConfig):
-            options |= SMALL_FIELD | {"samples": 4096}
+            options |= SMALL_FIELD | {"samples": 1024}
         known = {k: v for k, v in options.items() if hasattr(config, k)}
         method: Method = import_object(self.spec.method)(dataclasses.replace(config, **known))
         method.setup(self.data, seed=0, device=device)
