@@ -48,9 +48,9 @@ class MapFrame:
         return np.asarray(u @ vt)
 
     @property
-    def scale(self) -> float:
-        """Metres of the map per metre of the world, horizontally."""
-        return float(np.sqrt(np.linalg.norm(np.cross(self.matrix[0], self.matrix[1]))))
+    def scales(self) -> Array:
+        """Metres of the map per metre of the world, east, north and up. [3]"""
+        return np.asarray(np.linalg.norm(self.matrix, axis=1))
 
     def to_map(self, world: Array) -> Array:
         """Convert places in the world. [N, 3]"""
@@ -81,15 +81,24 @@ def map_frame(scene: Scene, crs: str | None) -> MapFrame:
     matrix = (convert(middle + steps) - convert(middle - steps)).T / (2 * STEP)
     offset = convert(middle[None])[0] - matrix @ middle
     made = MapFrame(name, matrix, offset, error=0.0)
-    if not abs(made.scale - 1) <= MAX_SCALE_ERROR:  # nor if it is not finite
-        raise ConfigError(
-            f"--crs {name}",
-            expected="a reference system whose scale is 1 in this region",
-            found=f"scale {made.scale:.3g}",
-            todo="choose another one, such as the zone of UTM",
-        )
+    _check_scales(made)
     errors = convert(centres) - centres @ matrix.T - offset
     return replace(made, error=float(np.linalg.norm(errors, axis=1).max()))
+
+
+def _check_scales(frame: MapFrame) -> None:
+    """Check that metres are metres in every direction: with equal areas, they need not be."""
+    flat = frame.matrix[:2]
+    known = np.isfinite(flat).all()
+    scales = np.linalg.svd(flat, compute_uv=False) if known else np.array([np.inf])
+    worst = scales[np.argmax(np.abs(scales - 1))]
+    if abs(worst - 1) > MAX_SCALE_ERROR:
+        raise ConfigError(
+            f"--crs {frame.crs}",
+            expected="a reference system whose scale is 1 in this region",
+            found=f"scale {worst:.3g}",
+            todo="choose another one, such as the zone of UTM",
+        )
 
 
 def _check_world(scene: Scene, poses: Array, crs: str | None) -> None:

@@ -54,7 +54,7 @@ def map_surface(render: Render, views: Sequence[DepthView], frame: MapFrame, gri
     for rows, columns in grid.tiles(TILE):
         camera, pose, altitude = camera_above(frame, grid, rows, columns)
         shown = render(camera, pose)
-        rise = (altitude - solid_depth(shown).astype(np.float64)) * np.linalg.norm(frame.matrix[2])
+        rise = (altitude - solid_depth(shown).astype(np.float64)) * frame.scales[2]
         heights[rows, columns] = (grid.low + grid.high) / 2 + rise
         colors[rows, columns] = to_bytes(shown.rgb)
     known = np.isfinite(heights)
@@ -105,7 +105,7 @@ def camera_above(
     north = grid.top - (rows.start + rows.stop) / 2 * grid.resolution
     middle = frame.to_world(np.array([[east, north, (grid.low + grid.high) / 2]]))[0]
     rotation = frame.axes * np.array([[1.0], [-1.0], [-1.0]])
-    focal = altitude * frame.scale / grid.resolution
-    camera = Camera(1, "PINHOLE", width, height, (focal, focal, width / 2, height / 2))
+    focal = altitude * frame.scales[:2] / grid.resolution
+    camera = Camera(1, "PINHOLE", width, height, (*focal.tolist(), width / 2, height / 2))
     centre = middle + altitude * frame.axes[2]
     return camera, pose_from_rotation_translation(rotation, -rotation @ centre), float(altitude)

@@ -42,6 +42,20 @@ def test_each_cell_has_the_height_at_its_centre(scene, resolution):
     assert (surface.colors[roof] == np.round(ROOF * 255)).all()
 
 
+def test_metres_that_differ_between_east_and_north(scene):
+    frame = replace(map_frame(scene, None), matrix=np.diag([1.01, 0.99, 1.0]))
+    grid = choose_grid(scene, frame, 0.1)
+    views = list(depth_views(ToyRun(), scene, 1))
+    heights = map_surface(partial(render, period=1), views, frame, grid).heights
+    places = np.dstack([grid.centres, np.zeros(grid.shape)]).reshape(-1, 3)
+    east, north, _ = frame.to_world(places).T.reshape(3, *grid.shape)
+    inside = np.minimum(
+        np.minimum(east - LOW[0], HIGH[0] - east), np.minimum(north - LOW[1], HIGH[1] - north)
+    )
+    known = np.isfinite(heights) & (np.abs(inside) > 0.02)
+    np.testing.assert_allclose(heights[known], np.where(inside > 0, 3.0, 0.0)[known], atol=1e-3)
+
+
 def test_heights_are_compared_with_the_points_that_the_period_sees(scene):
     frame = map_frame(scene, None)
     grid, surface = surface_of(scene, 0)
