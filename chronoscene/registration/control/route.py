@@ -9,7 +9,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import ConfigError
-from chronoscene.geodesy import ReferenceSystem
+from chronoscene.geodesy import Georeference, ReferenceSystem
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.features.correspondences import Matched
 from chronoscene.registration.photos.inputs import PhotoInputs
@@ -56,7 +56,7 @@ def resect_photos(
     control = [argument(p, known[p.name]) for p in points.points if p.role == "control"]
     ties = [argument(p, None) for p in points.points if p.role == "tie"]
     model, result = resected({"control": control, "ties": ties}, inputs, matched, context)
-    model = replace(model, georeference=frame)
+    model = replace(model, georeference=frame, gps_enu=_positions_in(frame, model, inputs))
     used = {c["name"] for c in control if c["clicks"]}
     left_out = {
         name: None if at is None else (np.subtract(at[0], known[name]).tolist(), at[1])
@@ -65,3 +65,13 @@ def resect_photos(
     model = replace(model, resection=Resection(result["deviations"], left_out))
     found = align_with_tie_points(model, points, mode="check", output=output, adjusted=used)
     return found.model, found
+
+
+def _positions_in(frame: Georeference | None, model: Registered, inputs: PhotoInputs) -> Array:
+    """GPS positions of the images of a model in another frame than that of all GPS. [N, 3]"""
+    found = np.full_like(model.gps_enu, np.nan)
+    if frame is not None and inputs.georeference is not None:
+        known = np.isfinite(model.gps_enu).all(axis=1)
+        places = inputs.georeference.to_geodetic(model.gps_enu[known])
+        found[known] = frame.to_enu(*places.T)
+    return found

@@ -4,20 +4,26 @@ import json
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.registration.generated import CaseSettings, generate_case
 from chronoscene.errors import ConfigError, SceneError
+from chronoscene.geodesy import Georeference
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.context import Options
+from chronoscene.registration.control import route
 from chronoscene.registration.control.resection import poses_of
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.photos.known_cameras import known_groups, read_cameras
 from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.tie_points import read_tie_points
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 
@@ -136,6 +142,24 @@ def test_few_photos_are_placed_and_say_how_well(few: Few, tmp_path: Path) -> Non
     assert found.position.level == "fail"
     assert found.position.objections[0].place in ("control point g2", "control points")
     assert any(o.place == "control point g2" for o in found.position.objections)
+
+
+def test_gps_is_compared_in_the_frame_of_the_control(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = generate_case(CaseSettings(seed=9, points=60, views=4, gps_gross=0)).model
+    gps = Georeference(51.0, 11.0, 200.0, "as stated")
+    where = gps.to_geodetic(model.gps_enu)
+    rows = [f"g{i},a.jpg,1,2,{x},51.002,350" for i, x in enumerate((11.0, 11.001, 11.002))]
+    file = tmp_path / "points.csv"
+    file.write_text("\n".join(["# crs: EPSG:4326", "point,image,x,y,X,Y,Z", *rows]))
+    found: Any = model, {"deviations": {}, "left_out": {}}
+    monkeypatch.setattr(route, "resected", lambda *_: found)
+    inputs: Any = SimpleNamespace(periods={}, georeference=gps)
+    nothing: Any = None
+    placed, _ = route.resect_photos(inputs, nothing, read_tie_points(file), None, nothing)
+    assert placed.georeference == Georeference(51.002, 11.001, 350.0, "as stated")
+    np.testing.assert_allclose(placed.georeference.to_geodetic(placed.gps_enu), where, atol=1e-6)
 
 
 def test_what_the_route_needs_is_said(few: Few, tmp_path: Path) -> None:
