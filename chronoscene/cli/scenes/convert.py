@@ -16,7 +16,11 @@ from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene, writable_formats
 from chronoscene.geodesy import Georeference, from_crs, read_projected
 from chronoscene.io.staging import check_outside
-from chronoscene.registration.report.coordinates import coordinate_files, write_coordinates
+from chronoscene.registration.report.coordinates import (
+    coordinate_files,
+    local_frame,
+    write_coordinates,
+)
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
 
@@ -92,7 +96,7 @@ def _local_frame(scene: Scene) -> Georeference:
     world = scene.world
     frame = from_crs(world.crs)
     if frame is not None and not any(world.offset):
-        return frame
+        return local_frame(scene) or frame  # without metres, its kind of heights is not known
     found, todo = "one without a reference system", "register it with GPS or ground control"
     if world.crs is not None:
         found = f"{world.crs} with the offset {', '.join(f'{x:.12g}' for x in world.offset)}"

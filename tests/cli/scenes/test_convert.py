@@ -74,7 +74,10 @@ def test_coordinates_in_a_reference_system(make_scene_folder, tmp_path):
     frame = Georeference(51.0, 11.0, 200.0, "as stated")
     world = {"unit": "metre", "crs": frame.crs, "offset": [0.0, 0.0, 0.0]}
     (folder / "sparse/world.json").write_text(json.dumps(world))
+    (folder / "georeference.json").write_text('{"height_kind": "relative"}')
     assert run(folder, tmp_path / "out", "--crs", "EPSG:32632").exit_code == 0
+    written = json.loads((tmp_path / "out/georeference.json").read_text())
+    assert written["height_kind"] == "relative"
     rows = list(csv.DictReader((tmp_path / "out/cameras.csv").open()))
     scene = read_scene(folder)
     assert [r["image"] for r in rows] == [f.name for f in scene.frames]
