@@ -327,7 +327,9 @@ def _words(
         return f"Control points, each without its own coordinates in turn: {left_out.text}."
     first = objections[0]
     start = (
-        "The model does not lie where surveyed points are."
+        "The surveyed points and GPS contradict each other; one of the two is wrong."
+        if level == "fail" and first.check == "gps"
+        else "The model does not lie where surveyed points are."
         if level == "fail"
         else "The model contradicts what its photos state; its lengths and heights may be wrong."
         if first.check == "metadata"

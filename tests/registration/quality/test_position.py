@@ -207,6 +207,8 @@ def test_control_far_from_gps_is_in_another_system(tmp_path: Path, made: Generat
     file.write_text(file.read_text().replace("EPSG:32632", "EPSG:32633"))
     _, position = judged(made.model, file)
     assert position.level == "fail" and position.objections[0].check == "gps"
+    assert position.check is not None and position.check.horizontal < 0.5
+    assert position.text.startswith("The surveyed points and GPS contradict each other")
 
 
 @pytest.fixture(scope="module")
