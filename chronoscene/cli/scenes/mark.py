@@ -32,9 +32,9 @@ from chronoscene.registration.ties.tie_points import by_photo, read_tie_points
     "--tie-scale",
     type=FiniteRange(0, min_open=True),
     default=1.0,
-    help="Size of these photos divided by that of the photos that its points were clicked in.",
+    help="Size of these photos divided by that of the photos in which the tie points were clicked.",
 )
-@click.option("--crs", help="Reference system of their coordinates, if the file names none.")
+@click.option("--crs", help="Reference system of the tie points, if their file names none.")
 @click.option(
     "--model",
     type=PATH,

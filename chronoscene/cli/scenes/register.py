@@ -128,7 +128,7 @@ FAILED = 1  # Exit status if a verdict is fail
     "--tie-scale",
     type=FiniteRange(0, min_open=True),
     default=DEFAULTS.tie_scale,
-    help="Size of these photos divided by that of the photos that were clicked in.",
+    help="Size of these photos divided by that of the photos in which the tie points were clicked.",
 )
 @click.option(
     "--report",
