@@ -34,7 +34,7 @@ def write_laz(
         dimensions: Further numbers of the points by their names. [N] each
     """
     import laspy
-    from pyproj import CRS
+    from laspy.vlrs.known import WktCoordinateSystemVlr
 
     more = dimensions or {}
     reach = float(np.ptp(xyz, axis=0).max()) if len(xyz) else 0.0
@@ -43,15 +43,29 @@ def write_laz(
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales = np.full(3, step)
     header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
-    header.add_crs(CRS.from_user_input(crs))
+    header.vlrs.append(WktCoordinateSystemVlr(_wkt(crs)))
+    header.global_encoding.wkt = True
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name, values.dtype) for name, values in more.items()]
     )
     points = laspy.LasData(header)
     points.xyz = xyz
     points.red, points.green, points.blue = rgb.astype(np.uint16).T * 257
+    points.return_number = points.number_of_returns = np.ones(len(xyz), np.uint8)  # never 0
     for name, values in more.items():
         points[name] = values
     data = BytesIO()
     points.write(data, do_compress=True)
     path.write_bytes(data.getbuffer())
+
+
+def _wkt(crs: str) -> str:
+    """Reference system as WKT 1, which LAS 1.4 demands; as WKT 2 where that cannot describe it."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    system = CRS.from_user_input(crs)
+    try:
+        return str(system.to_wkt("WKT1_GDAL", output_axis_rule=True))
+    except CRSError:
+        return str(system.to_wkt())

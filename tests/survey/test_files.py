@@ -61,8 +61,21 @@ def test_a_cloud(tmp_path, frame):
     np.testing.assert_array_equal(read["period"], 2)
     np.testing.assert_array_equal(read["sigma"], numbers["sigma"])
     assert read["period"].dtype == np.uint16 and read["sigma"].dtype == np.float32
+    assert (read.return_number == 1).all() and (read.number_of_returns == 1).all()
+    (wkt,) = read.header.vlrs.get("WktCoordinateSystemVlr")
+    assert read.header.global_encoding.wkt
+    assert wkt.string.startswith("PROJCS[" if frame is UTM else "LOCAL_CS[")  # WKT 1
     crs = read.header.parse_crs()
     assert crs.to_epsg() == 32632 if frame is UTM else crs.name == "local metres"
+
+
+@pytest.mark.parametrize(("code", "wkt"), [(2193, "PROJCS["), (8857, "PROJCRS[")])
+def test_a_cloud_in_other_systems(tmp_path, code, wkt):
+    """With north before east, and one that WKT 1 cannot describe."""
+    write_laz(tmp_path / "a.laz", np.zeros((1, 3)), np.zeros((1, 3), np.uint8), f"EPSG:{code}")
+    header = laspy.read(tmp_path / "a.laz").header
+    assert header.parse_crs().to_epsg() == code
+    assert header.vlrs.get("WktCoordinateSystemVlr")[0].string.startswith(wkt)
 
 
 def test_a_cloud_without_points(tmp_path):
