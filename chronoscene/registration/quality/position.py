@@ -131,7 +131,7 @@ class Position:
     ground_pixel: float | None
     """Metres that a pixel covers, median over the surveyed points."""
     scale_error: float | None = None
-    """Relative standard deviation of the scale by GPS."""
+    """Relative standard deviation of the scale by GPS, unless control determines the scale."""
     metadata: tuple[Comparison, ...] = ()
     """The model beside what its photos state."""
     left_out: Rmse | None = None
@@ -191,8 +191,8 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if points and gps is not None:
         gap = float(np.linalg.norm(np.median(_gps_errors(model)[1][:, :2], axis=0)))
         objections += check(POSITION_THRESHOLDS["gps"], gap, "ground control and GPS", "gps")
-    scale_error = None if gps is None else _scale_error(model)
-    if scale_error is not None and not controlled:
+    scale_error = None if gps is None or controlled else _scale_error(model)
+    if scale_error is not None:
         objections += check(POSITION_THRESHOLDS["scale"], 100 * scale_error, "GPS", "scale")
     compared = compare_with_metadata(model)
     if found is None or found.count < POSITION_THRESHOLDS["points"].doubtful:

@@ -91,6 +91,7 @@ def test_exact_control_and_check_points_pass(tmp_path: Path, made: Generated) ->
     assert (position.check.count, position.control.count) == (3, 5)
     assert position.check.horizontal < 0.2 and position.check.vertical < 0.2
     assert position.ground_pixel == pytest.approx(0.2, abs=0.1)
+    assert position.scale_error is None and judge_position(made.model).scale_error is not None
 
 
 @pytest.mark.parametrize("exchanged", [False, True])
