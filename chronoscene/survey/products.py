@@ -157,7 +157,7 @@ class Survey:
     def coordinates(self) -> dict[str, Any]:
         """Describe coordinates and absolute position."""
         frame, root = self.frame, self.scene.root
-        kind = _optional(root / GEOREFERENCE).get("height_kind", "as stated")
+        kind = _optional(root / GEOREFERENCE).get("height_kind", "as in the scene")
         return {
             "crs": None if frame.is_local else frame.crs,
             "note": "local metres: the scene has no georeference" if frame.is_local else None,

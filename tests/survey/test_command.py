@@ -21,6 +21,7 @@ from chronoscene.formats import chronoscene as scene_format
 from chronoscene.geodesy import Georeference
 from chronoscene.scene import WorldFrame
 from chronoscene.survey import difference, products
+from chronoscene.survey.map_frame import map_frame
 from chronoscene.survey.uncertainty import UNKNOWN
 
 PLACE = Georeference(46.5, 11.35, 300.0, "as stated")
@@ -49,6 +50,14 @@ def test_a_model_that_was_not_held_to_the_points_says_so(site, tmp_path):
     assert "note: the model was not held to the sparse points" in result.output
     toy.config.depth_weight = 0.1
     assert "note" not in survey(run, "--out", tmp_path / "held").output
+
+
+def test_heights_are_of_the_kind_that_a_registration_states(scene, tmp_path):
+    scene = replace(scene, world=WorldFrame("metre", PLACE.crs))
+    made = products.Survey(tmp_path, scene, map_frame(scene, None))
+    assert made.coordinates()["heights"] == "as in the scene; no geoid is applied"
+    (scene.root / "georeference.json").write_text('{"height_kind": "relative"}')
+    assert made.coordinates()["heights"] == "relative; no geoid is applied"
 
 
 def test_all_products_of_a_run(site, tmp_path):
