@@ -91,14 +91,15 @@ def _stated(captures: Sequence[Capture], name: str) -> Array:
 def _heights(captures: Sequence[Capture], has: Mask) -> tuple[Array, HeightKind, list[str]]:
     """Choose one kind of height for all photos: mixing kinds would tilt or distort the frame."""
     stated, relative = (_stated(captures, name) for name in ("altitude", "relative_altitude"))
-    if np.isfinite(stated[has]).all():
+    known = np.isfinite(stated)
+    missing = int((has & ~known).sum())
+    if not missing:
         return stated, "as stated", []
     if np.isfinite(relative[has]).all():
-        return relative, "relative", ["heights are relative to take-off: no others are stated"]
-    known = np.isfinite(stated)
+        remark = f"heights are relative to take-off: {missing} photos state no others"
+        return relative, "relative", [remark]
     if known.sum() >= 0.5 * has.sum():
         filled = np.where(known, stated, np.nanmedian(stated))
-        missing = int((has & ~known).sum())
         return filled, "as stated", [f"{missing} photos state no height: the median is used"]
     return np.zeros(len(captures)), "none", ["most photos state no height: 0 is used for all"]
 

@@ -111,6 +111,7 @@ def test_heights_are_of_one_kind() -> None:
     assert found.georeference is not None
     assert found.georeference.height_kind == "relative"
     assert np.ptp(found.enu[:, 2]) == pytest.approx(19.0, abs=0.01)
+    assert "heights are relative to take-off: 10 photos state no others" in found.remarks
     none = locate(captures(GRID, altitudes=[None] * 20))
     assert none.georeference is not None
     assert none.georeference.height_kind == "none"
