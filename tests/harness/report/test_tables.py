@@ -10,6 +10,7 @@ from made_runs import record, scored
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import Failure
+from chronoscene.harness.report.comparable import apart
 from chronoscene.harness.report.published import load_published
 from chronoscene.harness.report.summary import ENTRY_COLUMNS, in_region, summarise
 from chronoscene.harness.report.tables import footnotes, format_runs, period_name, readable_tables
@@ -204,6 +205,15 @@ def test_the_overview_has_metrics_and_size_side_by_side():
         *(("quay", "PSNR [dB]"), ("", "SSIM")),
     ]
     assert overview.heads[5:] == [("mean of scenes", "PSNR [dB]"), ("", "SSIM"), "checkpoint [MB]"]
+
+
+def test_the_overview_of_several_tests_of_a_scene_shows_the_size_of_none():
+    narrow = [run.model_copy(update={"max_width": 160, "checkpoint_bytes": 5}) for run in RUNS]
+    (overview, *others) = grids(apart([*RUNS, *narrow]))
+    assert [first for first, _ in overview.head_lines if first] == [
+        *("method", "plaza [width 1600]", "plaza [width 160]")
+    ]
+    assert sum("checkpoint [MB]" in table.heads for table in others) == 2
 
 
 @pytest.mark.parametrize(
