@@ -12,7 +12,7 @@ from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import UNTRAINED, Failure, RunRecord
 from chronoscene.harness.files.strategies import period_part
-from chronoscene.harness.report.comparable import effort_of, several_scenes
+from chronoscene.harness.report.comparable import effort_of, scene_of, several_scenes
 from chronoscene.harness.report.protocol_tables import protocol_rows, protocol_tables
 from chronoscene.harness.report.summary import (
     AGGREGATES,
@@ -504,7 +504,9 @@ def published_notes(table: PublishedTable, records: Sequence[RunRecord]) -> list
     """List the notes on published rows, and the scenes that have none."""
     known = {row.scene.casefold() for row in table.rows}
     strange = dict.fromkeys(
-        run.scene for run in records if not (run.protocol or run.scene.casefold() in known)
+        run.scene
+        for run in records
+        if not (run.protocol or scene_of(run.scene).casefold() in known)
     )
     notes = [f"published: {table.title}; {table.hardware}. {' '.join(table.notes)}"]
     if strange:

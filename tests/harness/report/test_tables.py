@@ -271,6 +271,9 @@ def test_published_rows_stand_below_the_measured_ones_and_are_never_marked():
     assert "- published: ChronoGS: Disentangling" in text
     assert "- nothing is published of plaza; the scenes are Lawncourt, " in text
     assert text.count("(published)") == 8  # not in the tables by period
+    tests = apart([record(scene="Lawncourt", max_width=width) for width in (160, 320)])
+    text = format_runs(tests, [], "markdown", ["psnr"], published=load_published())
+    assert "| ChronoGS (published) | 22.16 | 22.16 |" in text and "nothing is" not in text
     others = [record(m, scene=scene) for m in "ab" for scene in ("Lawncourt", "plaza")]
     for run in others:
         for values in (*run.aggregates.values(), *run.periods.values()):
