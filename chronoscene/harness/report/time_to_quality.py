@@ -57,7 +57,8 @@ def whole_curve(points: Sequence[CurvePoint], strategy: str) -> Curve | None:
     """Combine the probes of a run in one curve; None if they are not of one set of views.
 
     The models of ``separate`` count as if they were trained by turns: at each probe their seconds
-    are added up and their PSNR is averaged. The stages of ``sequential`` probe other views each.
+    are added up and their PSNR is averaged, if their period has a test view. The stages of
+    ``sequential`` probe other views each.
     """
     by_model = [
         np.array([(point.seconds, point.psnr) for point in part]).T
@@ -66,7 +67,9 @@ def whole_curve(points: Sequence[CurvePoint], strategy: str) -> Curve | None:
     if not by_model or STRATEGIES[strategy].in_order or len({c.shape for c in by_model}) > 1:
         return None
     stacked = np.stack(by_model)
-    curve: Curve = np.stack([stacked[:, 0].sum(axis=0), stacked[:, 1].mean(axis=0)])
+    if not len(probed := stacked[~np.isnan(stacked[:, 1]).all(axis=1), 1]):
+        return None
+    curve: Curve = np.stack([stacked[:, 0].sum(axis=0), probed.mean(axis=0)])
     return curve if np.isfinite(curve).all() else None
 
 

@@ -53,6 +53,10 @@ def test_models_count_as_if_trained_by_turns():
     ]
     assert whole_curve(points, "separate").tolist() == [[4, 8], [20, 25.5]]
     assert whole_curve(points, "sequential") is None, "each stage probes other views"
+    unseen = [CurvePoint(s, 1, 1, math.nan, 1, "period-2") for s in (5, 9)]
+    found = whole_curve([*points, *unseen], "separate")
+    assert found.tolist() == [[9, 17], [20, 25.5]], "a period without test views takes time, too"
+    assert whole_curve(unseen, "separate") is None
     assert whole_curve(points[:3], "separate") is None
     assert whole_curve([], "joint") is None
     assert whole_curve([CurvePoint(1, 1, 1, math.nan, 1, "all")], "joint") is None
