@@ -213,7 +213,7 @@ def _check_texts(record: RunRecord) -> None:
     for leaf in _leaves(record.model_dump()):
         if isinstance(leaf, str) and (not leaf.isprintable() or "<" in leaf or len(leaf) > 1000):
             raise ValueError(f"a text with markup, control characters or too long: {leaf[:60]!r}")
-    if len(record.device) > 100 or len(record.commit) > 100:
+    if len(record.device) > 200 or len(record.commit) > 100:  # several if it was resumed
         raise ValueError("a text too long: device or commit")
 
 

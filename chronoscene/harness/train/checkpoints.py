@@ -54,6 +54,8 @@ class LoopState(BaseModel):
     """Number of times that the training continued from a checkpoint."""
     commits: list[str] = []
     """Commits of the code that trained up to a checkpoint, without repetitions."""
+    devices: list[str] = []
+    """Devices likewise, with their threads."""
     peak_memory_bytes: int = 0
     """Peak of the processes so far; 0 if the system does not report it."""
     random_state: dict[str, Any] = {}
@@ -72,6 +74,8 @@ class Checkpoints:
     """Settings of the run, written beside the folder."""
     commit: str
     """Commit of the code that trains now."""
+    device: str
+    """Device on which it trains, with its threads."""
     every: float
     """Seconds between checkpoints."""
     keep_last: bool
@@ -131,8 +135,9 @@ class Checkpoints:
         """Write a checkpoint; the training goes on without it if the disk refuses."""
         state.random_state = _random_state()
         state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes() or 0)
-        if self.commit not in state.commits:
-            state.commits.append(self.commit)
+        for known, now in ((state.commits, self.commit), (state.devices, self.device)):
+            if now not in known:
+                known.append(now)
         partial = self.folder / partial_name(str(state.iterations))
         settings = self.folder.parent / CONFIG_FILE
         try:

@@ -85,6 +85,9 @@ class Machine:
     device: str
     threads: int
 
+    def __str__(self) -> str:
+        return describe_device(self.device, self.threads)
+
 
 def run_job(job: Job, report: Report | None = None) -> None:
     """Train, save, render and score; writes into ``job.staging`` only.
@@ -128,7 +131,7 @@ def run_job(job: Job, report: Report | None = None) -> None:
                 method = make_method(run.spec, run.config)
             checkpoints = None
             if run.spec.resumable:
-                checkpoints = _checkpoints(run, part, len(parts), display)
+                checkpoints = _checkpoints(run, part, len(parts), machine, display)
             writer = writers.get(part.name, final)
             outcomes.append(
                 _run_part(run, method, part, stop, machine, writer, display, checkpoints)
@@ -261,13 +264,16 @@ def _run_part(
     return PartOutcome(trained, saved, size, seconds, sharing, total)
 
 
-def _checkpoints(run: ResolvedRun, part: Part, parts: int, display: ProgressDisplay) -> Checkpoints:
+def _checkpoints(
+    run: ResolvedRun, part: Part, parts: int, machine: Machine, display: ProgressDisplay
+) -> Checkpoints:
     """Return the checkpoints of one model of the run."""
     job = run.job
     return Checkpoints(
         folder=job.training / part.name,
         settings=run.document,
         commit=job.commit,
+        device=str(machine),
         every=job.settings.checkpoint_seconds,
         # With several models, those that are done must not be trained again.
         keep_last=job.settings.keep_training or parts > 1,
@@ -316,6 +322,7 @@ def _record(
     """The record of the run, without its scores."""
     job, spec, tests = run.job, run.spec, len(scene.select(split="test"))
     code = [commit for outcome in outcomes for commit in outcome.trained.commits]
+    devices = [device for outcome in outcomes for device in outcome.trained.devices]
     # The stages of a training leave one model.
     models = outcomes[-1:] if STRATEGIES[job.strategy].in_order else outcomes
     drawn = [model.drawn for model in models]
@@ -340,7 +347,7 @@ def _record(
         drawn=None if None in drawn or not tests else sum(filter(None, drawn)) / tests,
         checkpoint_bytes=sum(records.size_of(model.folder) for model in models),
         peak_memory_bytes=peaks[0],
-        device=describe_device(machine.device, machine.threads),
+        device="; ".join(dict.fromkeys([*devices, str(machine)])),
         commit="; ".join(dict.fromkeys([*code, job.commit])),
         skipped={},
         absent=absent,

@@ -250,6 +250,7 @@ def test_a_training_that_goes_on_with_photos_from_disk_ends_alike(make_scene, se
 
     undisturbed = run(ImageStore(scene))
     common = {"settings": {}, "commit": "abc", "every": 0.0, "keep_last": False, "start": None}
+    common["device"] = "cpu"
     folder = tmp_path / "training" / "all"
     for until in (5, 9):
         with pytest.raises(SystemExit):

@@ -33,6 +33,7 @@ def make(tmp_path):
 
     def make(**changes):
         fields = {"settings": {"seed": 3}, "commit": "abc", "every": 0.0, "keep_last": False}
+        fields["device"] = "cpu (Test, 1 thread)"
         fields |= {"folder": tmp_path / "training" / "all", "start": None, "log": said.append}
         return Checkpoints(**fields | changes)
 
@@ -78,7 +79,8 @@ def test_everything_comes_back(make):
     found = make().restore(Numbers())
     assert found.seconds == 1 / 3 and math.isnan(found.curve[0].psnr)
     assert (found.empty_steps, found.skipped_steps, found.resumed) == (2, 1, 1)
-    assert found.commits == ["abc"] and found.peak_memory_bytes > 10e6
+    assert found.commits == ["abc"] and found.devices == ["cpu (Test, 1 thread)"]
+    assert found.peak_memory_bytes > 10e6
     assert (random.random(), np.random.normal(), float(torch.rand(()))) == drawn
     assert json.loads((checkpoints.folder.parent / "config.json").read_text()) == {"seed": 3}
     assert make.said == ["going on from iteration 9"]

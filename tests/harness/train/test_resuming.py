@@ -160,6 +160,19 @@ def dying(*args):
     raise SystemExit
 
 
+def test_a_training_on_two_devices_names_both(bench_here, tmp_path, monkeypatch):
+    options = {"iterations": 20, "preset": "slow", "checkpoint_seconds": 0.0}
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(Checkpoints, "finish", dying)
+        patch.setattr(worker, "describe_device", lambda *machine: "cpu (Old, 1 thread)")
+        bench_here(TOY, **options)
+    monkeypatch.setattr(worker, "describe_device", lambda *machine: "cpu (New, 8 threads)")
+    bench_here(TOY, **options)
+    record = read_run(run_of(tmp_path / "runs"))
+    assert (record.resumed, record.iterations) == (1, 20)
+    assert record.device == "cpu (Old, 1 thread); cpu (New, 8 threads)"
+
+
 def test_what_is_left_of_deleted_checkpoints_is_not_gone_on_from(bench_here, tmp_path, monkeypatch):
     options = {"iterations": 20, "preset": "slow", "checkpoint_seconds": 0.0}
     with monkeypatch.context() as patch:
