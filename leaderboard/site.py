@@ -12,7 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from chronoscene.figures.canvas import period_colors
-from chronoscene.harness.report.comparable import Setting, comparable, setting_of
+from chronoscene.harness.report.comparable import Setting, apart, comparable, setting_of
 from chronoscene.harness.report.published import PublishedTable
 from chronoscene.harness.report.summary import name_of, published_entries, summarise
 from chronoscene.images.store import MAX_WIDTH
@@ -137,20 +137,15 @@ class _Site:
 
     def _by_effort(self, kind: str, scenes: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
         """Make rows of the first page: efforts by their order, the best methods of each first."""
-        measured: dict[tuple[Any, ...], dict[str, Any]] = {}
-        for setting, (_, part) in self.groups[kind].items():
-            if setting.scene not in scenes:
-                continue
-            width = setting.max_width
-            effort = setting.effort + (f", {width} pixels wide" if width != MAX_WIDTH else "")
+        measured: dict[tuple[str, str, str], dict[str, Any]] = {}
+        groups = {s: found for s, found in self.groups[kind].items() if s.scene in scenes}
+        for setting, effort in _efforts(groups).items():
+            part = groups[setting].values
             for row in part[(part.quantity == "psnr") & (part.column == "macro")].itertuples():
-                scene = setting.scene
-                key: tuple[Any, ...] = (row.method, row.label, effort)
-                while scene in measured.get(key, {}):  # other photos or test views
-                    key = (*key, "")
-                measured.setdefault(key, {})[scene] = make_cell(row, ranked=kind == VERIFIED)
+                cells = measured.setdefault((row.method, row.label, effort), {})
+                cells[setting.scene] = make_cell(row, ranked=kind == VERIFIED)
         efforts: dict[str, list[dict[str, Any]]] = {}
-        for (method, label, effort, *_), cells in measured.items():
+        for (method, label, effort), cells in measured.items():
             row = {"method": method, "label": label, "cells": cells}
             efforts.setdefault(effort, []).append(row)
         for rows in efforts.values():
@@ -217,6 +212,21 @@ def _grouped(standings: Iterable[Standing], kind: str) -> dict[Setting, Part]:
         setting: Part(groups[setting], summarise(groups[setting]))
         for setting in sorted(groups, key=_place)
     }
+
+
+def _efforts(groups: Mapping[Setting, Part]) -> dict[Setting, str]:
+    """Name the effort of each setting, and its test where a scene has several of one effort."""
+    named: dict[tuple[str, str], list[Setting]] = {}
+    for setting in groups:
+        width = setting.max_width
+        effort = setting.effort + (f", {width} pixels wide" if width != MAX_WIDTH else "")
+        named.setdefault((setting.scene, effort), []).append(setting)
+    found = {}
+    for (_, effort), several in named.items():
+        tests = [run.scene for run in apart([groups[setting].runs[0] for setting in several])]
+        for setting, test in zip(several, tests, strict=True):
+            found[setting] = f"{effort}, {test}" if len(several) > 1 else effort
+    return found
 
 
 def _place(setting: Setting) -> tuple[str | int, ...]:

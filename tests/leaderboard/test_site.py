@@ -212,6 +212,15 @@ def test_scenes_of_one_name_have_rows_of_their_own(make_run, enter, tmp_path):
         assert "23.00" in text and "12.50" in text
 
 
+def test_scenes_of_one_name_are_not_ranked_together(make_run, enter, tmp_path):
+    enter([make_run()], tmp_path / "e")
+    enter([make_run("4dgs", split_hash="f" * 64)], tmp_path / "e")
+    write_site(standings(tmp_path / "e"), load_published(), tmp_path / "site")
+    rows = Page(tmp_path / "site/index.html").rows
+    at = [rows.index(f" Verified: 100 training steps, square [split {c * 6}]") for c in "bf"]
+    assert [rows[i + 1].split()[0].strip(",") for i in at] == ["3DGS", "4DGS"]
+
+
 def test_pages_say_what_is_of_older_code_and_the_role_of_a_scene(make_run, enter, tmp_path):
     (path,) = enter([make_run(seed=0)], tmp_path / "e")
     path.write_text(path.read_text().replace('"outdated": false', '"outdated": true'))
