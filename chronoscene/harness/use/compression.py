@@ -30,7 +30,7 @@ from chronoscene.compression.positions import Grid, morton
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.harness.files.ground_truth import ground_truth_folder
 from chronoscene.harness.files.predictions import ImageWriter, to_bytes
-from chronoscene.harness.files.provenance import config_hash
+from chronoscene.harness.files.provenance import config_hash, describe_device
 from chronoscene.harness.files.records import (
     CHECKPOINT,
     CONFIG_FILE,
@@ -285,10 +285,14 @@ def _sensitivity(model: _SortedModel, rules: Mapping[str, Columns], log: Log) ->
 
 
 def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, truth: Path) -> None:
-    """Render the test views of a run whose folder has its models, and write its record."""
+    """Render the test views of a run whose folder has its models, and write its record.
+
+    The time of rendering is known only on the device of the run, which it stands for in tables.
+    """
     writer, seconds = ImageWriter(run.folder / PREDICTIONS), 0.0
     frames = scene.select(split="test")
-    set_threads(run.record.threads)  # as the run that it is compared with
+    threads = set_threads(run.record.threads)  # as the run that it is compared with
+    device = describe_device(run.device, threads)
     for frame in frames[:1]:  # kernels compile, or are loaded, at first use
         run.render(store.camera(frame), frame.cam_from_world, frame.period)
     for frame in frames:
@@ -305,6 +309,10 @@ def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, truth
         "config_hash": read_config(run.folder)["config_hash"],
         "render_seconds": seconds / len(frames) if frames else None,
     }
+    if frames and device != run.record.device:
+        changed["render_seconds"] = None
+        reason = f"compressed on another device than that of the run: {device}"
+        changed["absent"] = run.record.absent | {"render_seconds": reason}
     score_run(run.folder, run.record.model_copy(update=changed), truth, make_scorers())
 
 

@@ -58,6 +58,7 @@ def test_the_plain_form_is_a_run_that_renders_and_scores_as_before(copied, metho
     assert after.checkpoint_bytes == sum(file.stat().st_size for file in files)
     assert f"{before.checkpoint_bytes:,} bytes -> {after.checkpoint_bytes:,} bytes" in printed
     assert after.checkpoint_bytes < 0.7 * before.checkpoint_bytes
+    assert after.render_seconds and after.device == before.device
     assert after.variant.endswith("compressed=plain") and after.config_hash != before.config_hash
     macro = before.aggregates["macro"]["psnr"]
     assert after.aggregates["macro"]["psnr"] == pytest.approx(macro, abs=0.02)
@@ -67,6 +68,16 @@ def test_the_plain_form_is_a_run_that_renders_and_scores_as_before(copied, metho
         image = run.render(frame.camera, frame.cam_from_world, frame.period).rgb
         written = load_image(out / "predictions", entry)
         np.testing.assert_allclose(255 * image.clip(0, 1), written, atol=0.51)
+
+
+def test_the_time_of_rendering_is_not_that_of_another_device(copied, monkeypatch):
+    folder, other = copied("3dgs-period"), "cpu (Other, 1 thread)"
+    monkeypatch.setattr(compression, "describe_device", lambda *machine: other)
+    out, _ = compress(folder, "--plain")
+    assert read_run(folder).render_seconds and read_run(out).render_seconds is None
+    assert other in read_run(out).absent["render_seconds"]
+    printed = succeed("table", folder.parents[2]).stdout
+    assert "absent: rendering [ms]: compressed on another device" in printed
 
 
 def training_psnr(folder):
