@@ -94,10 +94,13 @@ def fit_gps(scene: RawScene) -> GpsFit | None:
         exif = scene.headers[name].exif if name in scene.headers else None
         if exif is not None and exif.has_position and scene.is_posed[i]:
             rows.append(i)
-            places.append((exif.latitude, exif.longitude, exif.altitude or 0.0))
+            places.append((exif.latitude, exif.longitude, exif.altitude))
     if len(rows) < MIN_PHOTOS:
         return None
     latitude, longitude, altitude = np.array(places, np.float64).T
+    # Another height than that of the rest would tilt the fit, and change its scale.
+    known = altitude[np.isfinite(altitude)]
+    altitude = np.where(np.isfinite(altitude), altitude, np.median(known) if len(known) else 0.0)
     middle = (float(np.median(latitude)), median_longitude(longitude), float(np.median(altitude)))
     target = Georeference(*middle, "as stated").to_enu(latitude, longitude, altitude)
     spread = float(np.median(np.linalg.norm(target[:, :2], axis=1)))

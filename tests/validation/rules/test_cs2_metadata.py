@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene.validation.checks.photo_metadata import fit_gps
 from chronoscene.validation.folder.scene_folder import RawScene
 
 IMAGES, WORLD = "sparse/0/images.txt", "sparse/world.json"
@@ -101,6 +102,23 @@ def test_photo_of_another_period(scene):
 def test_positions_that_fit_are_silent(scene):
     tag_places(scene)
     assert {f.code for f in scene.validate().findings} == {"CS507"}
+
+
+@pytest.mark.parametrize("count", [5, len(NAMES)])
+def test_photos_without_a_height_are_at_that_of_the_others(scene, count):
+    tag_places(scene)
+    for name in NAMES[:count]:
+        path = scene.path(f"images/{name}")
+        with Image.open(path) as image:
+            image.load()
+            exif = image.getexif()
+        gps = dict(exif.get_ifd(0x8825))
+        exif.get_ifd(0x8825).clear()
+        exif.get_ifd(0x8825).update({tag: gps[tag] for tag in gps if tag not in (5, 6)})
+        image.save(path, exif=exif)
+    fit = fit_gps(RawScene(scene.root))
+    assert fit.metres_from_world.scale == pytest.approx(METRES, rel=0.01)
+    assert fit.distance.max() < 1
 
 
 def test_photo_far_from_its_position(scene):
