@@ -125,11 +125,15 @@ def losses(scene: Scene) -> list[str]:
 
 
 def _written_names(scene: Scene) -> dict[str, str]:
-    """Return the name of each image; names that begin with a day of their period already stay."""
+    """Return the name of each image; names that begin with a day of their period already stay.
+
+    Not those in folders: it is the file whose name begins with the day.
+    """
     dated = _dated(scene)
     starts = [p.date or "" if dated else f"{p.id + 1:04d}" for p in scene.periods]
     heads = [(starts[f.period], f.name.partition("_")[0]) for f in scene.frames]
-    if all(_DAY.fullmatch(head) and head.startswith(start) for start, head in heads):
+    flat = not any("/" in frame.name for frame in scene.frames)
+    if flat and all(_DAY.fullmatch(head) and head.startswith(start) for start, head in heads):
         return {f.name: f.name for f in scene.frames}
     days = [start + "-01" * (2 - start.count("-")) for start in starts]
     return {f.name: f"{days[f.period]}_" + f.name.replace("/", "_") for f in scene.frames}

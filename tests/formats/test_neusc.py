@@ -141,6 +141,17 @@ def test_written_scenes_keep_what_the_years_say(make_scene_folder, tmp_path):
     assert [frame.name for frame in read_scene(second).frames] == names
 
 
+def test_days_that_folders_begin_with_go_to_the_files(make_scene_folder, tmp_path):
+    scene = read_scene(make_scene_folder({"2016-04-03_spring/a.png": 0, "2018-10-03_b/a.png": 1}))
+    table = (Period(0, "spring", "2016-04-03"), Period(1, "autumn", "2018-10-03"))
+    again = read_scene(neusc.write(replace(scene, periods=table), tmp_path / "out"))
+    assert (again.format, again.periods) == ("neusc", table)
+    assert [(frame.name, frame.period) for frame in again.frames] == [
+        ("2016-04-03_2016-04-03_spring_a.png", 0),
+        ("2018-10-03_2018-10-03_b_a.png", 1),
+    ]
+
+
 @pytest.mark.parametrize("dates", [(None, None), ("2016-04", "2016-09"), ("2018", "2016")])
 def test_periods_without_years_of_their_own_are_numbered(make_scene_folder, tmp_path, dates):
     scene = read_scene(make_scene_folder())
