@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from chronoscene.errors import SceneError
@@ -132,11 +133,13 @@ def _write_images(
 def _resample(
     sources: tuple[Path, Path | None], targets: tuple[Path, Path], change: undistortion.CameraChange
 ) -> None:
-    """Resample an image, and its mask if something of it is ignored."""
-    (source, _), (target, new_mask) = sources, targets
+    """Resample an image, and its mask if it has one or something of it is ignored."""
+    (source, old_mask), (target, new_mask) = sources, targets
     image, mask = load_photo(*sources)
     places = undistortion.sampling_map(change)
     pixels = undistortion.warp(image, *places)
+    if mask is None and old_mask is not None:
+        mask = np.ones(image.shape[:2], bool)  # one that ignores nothing is still a mask
     if mask is not None:
         new_mask.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(undistortion.warp_mask(mask, *places)).convert("L").save(new_mask)

@@ -12,6 +12,7 @@ from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
 from chronoscene.images.decoding import load_rgb
+from chronoscene.images.masks import mask_place
 from chronoscene.images.store import ImageStore
 from chronoscene.images.undistortion import (
     CameraChange,
@@ -509,6 +510,19 @@ def test_a_folder_in_use_is_refused_before_the_work(make_distorted, tmp_path):
     scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
     with pytest.raises(SceneError, match="expected a new or empty folder"):
         undistort(scene, tmp_path)
+
+
+def test_a_mask_that_ignores_nothing_stays(make_distorted, tmp_path):
+    """Else some images of a period had masks and some had none, which nerfstudio refuses."""
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
+    for frame in scene.frames:
+        mask = scene.root / mask_place(frame.name)
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", SIZE, 255).save(mask)
+    new = undistort(read_scene(scene.root), tmp_path / "out").scene
+    assert list(new.masks) == [frame.name for frame in scene.frames]
+    mask = np.asarray(Image.open(new.masks["b/1.png"]))
+    assert mask.shape[::-1] == new.frames[0].camera.size and mask.all()
 
 
 @pytest.mark.parametrize("distorted", [True, False])
