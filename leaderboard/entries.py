@@ -165,7 +165,7 @@ def predictions_folder(entry: Path, seed: int) -> Path:
 
 
 def refused(place: Path, found: str) -> ConfigError:
-    """Make the error of an entry, or of a run for one, that is refused."""
+    """Make the error of an entry that is refused."""
     return ConfigError(
         place,
         expected="a measured entry, as chronoscene submit writes it",

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from chronoscene.errors import ConfigError
 from chronoscene.harness.files.ground_truth import truth_of
 from chronoscene.harness.files.predictions import read_manifest, write_manifest
 from chronoscene.harness.files.records import (
@@ -31,7 +32,6 @@ from leaderboard.entries import (
     predictions_folder,
     read_entry,
     reason_of,
-    refused,
 )
 from leaderboard.verification import check_values
 
@@ -69,12 +69,23 @@ def submit(folders: Iterable[Path], to: Path) -> list[Path]:
         try:
             entries[path] = MeasuredEntry(outdated=outdated, runs=runs)
         except ValidationError as error:
-            raise refused(folder, reason_of(error)) from error
+            raise _refused(folder, reason_of(error)) from error
     for place, source in sources.items():
         _copy_predictions(source, place)
     for path, entry in entries.items():
         write_text_atomic(path, entry.model_dump_json(indent=1) + "\n")
     return [*entries]
+
+
+def _refused(folder: Path, found: str) -> ConfigError:
+    """Make the error of a run that cannot be in an entry."""
+    return ConfigError(
+        folder,
+        expected="a finished run that can be an entry",
+        found=found,
+        todo="submit runs as bench wrote them; a scene of yours must not be named like one in "
+        "leaderboard/scenes.toml",
+    )
 
 
 def _copy_predictions(source: Path, place: Path) -> None:
@@ -108,14 +119,14 @@ def entry_run(folder: Path) -> EntryRun:
     predictions = folder / PREDICTIONS
     manifest = read_manifest(predictions)
     if manifest.scene_hash != record.scene_hash:
-        raise refused(folder, "predictions of another scene")
+        raise _refused(folder, "predictions of another scene")
     values: dict[str, dict[str, float]] = {}
     for row in read_rows(folder):
         if row.region == ALL and row.rendered_period == row.camera_period:
             values.setdefault(row.view, {})[row.metric] = row.value
     images = {i.view: i for i in manifest.own_images}
     if not values.keys() <= images.keys():
-        raise refused(folder, "other views in its rows than among its predictions")
+        raise _refused(folder, "other views in its rows than among its predictions")
     try:
         run = EntryRun(
             record=record.model_copy(update={"regions": {}, "stages": {}, "transfer": {}}),
@@ -130,7 +141,7 @@ def entry_run(folder: Path) -> EntryRun:
             ),
         )
     except ValidationError as error:
-        raise refused(folder, reason_of(error)) from error
+        raise _refused(folder, reason_of(error)) from error
     scorers = make_scorers({row.metric for row in run.rows})
     check_values(folder, run, score_folder(predictions, truth_of(folder.resolve()), scorers))
     return run

@@ -72,6 +72,14 @@ def test_predictions_of_another_scene_are_refused(make_run, tmp_path):
         submit([run], tmp_path / "entries")
 
 
+def test_a_scene_that_only_has_the_name_of_a_known_one_is_refused(make_run, tmp_path):
+    run = make_run(scene="demo")
+    found = r"than demo has in scenes\.toml .*; .* a scene of yours must not be named like one in"
+    with pytest.raises(ConfigError, match=rf"expected a finished run .*, found another .*{found}"):
+        submit([run], tmp_path / "entries")
+    assert not (tmp_path / "entries").exists()
+
+
 def test_a_value_without_its_image_is_refused(make_run, tmp_path):
     run = make_run()
     manifest = run / "predictions/manifest.json"
