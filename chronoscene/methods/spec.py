@@ -150,7 +150,8 @@ def import_object(reference: str) -> Any:
                 reference,
                 expected="an importable module:Name",
                 found=str(error),
-                todo="check the spelling, and that its package is installed",
+                todo="check the spelling; start the command in the folder of the module, or "
+                "install its package",
             ) from error
         raise ConfigError(
             reference,

@@ -135,6 +135,7 @@ def test_unknown_method_names_the_known_ones():
     [
         ("no.such:SPEC", "expected an importable module:Name, found No module named 'no'; check"),
         ("whole.part:SPEC", "importable module:Name, found No module named 'whole.part'; 'whole'"),
+        ("no.such:SPEC", "; start the command in the folder of the module, or install its package"),
         (":SPEC", "expected an importable module:Name, found Empty module name; check"),
         (".whole:SPEC", "expected an importable module:Name, found the 'package' argument"),
         ("whole:SPECS", "expected a name in the module whole, found none called 'SPECS'; did you"),
