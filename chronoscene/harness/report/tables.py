@@ -33,7 +33,7 @@ from chronoscene.harness.report.summary import (
 )
 from chronoscene.io import tables
 from chronoscene.io.tables import Head, Table
-from chronoscene.io.wording import printable
+from chronoscene.io.wording import counted, printable
 from chronoscene.metrics.registry import all_metrics, metric_info
 
 if TYPE_CHECKING:
@@ -445,7 +445,10 @@ def footnotes(
         fewest = min(filter(None, counts), default=FEW_VIEWS)
         notes.append(
             "†: at 95 %, not separated from the best of its column, which was chosen among all"
-            + (f"; {fewest} test views of a period separate little" * (fewest < FEW_VIEWS))
+            + (
+                f"; periods with {counted(fewest, 'test view')} separate little"
+                * (fewest < FEW_VIEWS)
+            )
         )
     for name, title in (("device", "device"), ("commit", "code")):
         values = dict.fromkeys(str(getattr(run, name)) for run in records)
@@ -460,14 +463,14 @@ def footnotes(
         efforts = _grouped((effort_of(run), f"{run.title} ({run.preset})") for run in records)
         said = "; ".join(f"{effort}: {names}" for effort, names in efforts)
         notes.append(f"efforts differ, and a difference may be theirs: {said}")
-    counted = [(r.primitive, r.title) for r in records if r.primitives is not None and not wanted]
+    units_of = [(r.primitive, r.title) for r in records if r.primitives is not None and not wanted]
     shared = entries.quantity.isin([cost.name for cost in SHARING]).any()
     if shared and not wanted and not macro_only:
         notes.append(
             "invariant: primitives with one block of features for all periods; blocks each: mean "
             "over primitives; numbers: those stored for one period alone, mean over periods"
         )
-    if units := "; ".join(f"{unit} of {titles}" for unit, titles in _grouped(counted)):
+    if units := "; ".join(f"{unit} of {titles}" for unit, titles in _grouped(units_of)):
         notes.append(f"primitives: {units}")
     absent = _grouped((why, name) for run in records for name, why in _absent(run, wanted))
     notes += [f"absent: {names}: {reason}" for reason, names in absent]

@@ -184,7 +184,7 @@ def test_intervals_differences_and_ties():
     assert c[2] == "-5.00 [-5.00, -5.00]"
     assert (1, 3) in table.ties and not {place for place in table.ties if place[0] != 1}
     found = notes(SCORED, [])
-    assert any("; 4 test views of a period separate little" in n for n in found if n[0] == "†")
+    assert any("; periods with 4 test views separate little" in n for n in found if n[0] == "†")
     assert any("[ ]: 95 %" in note for note in found)
     assert any("the spread of seeds is unknown" in note for note in found)
     assert not any(note.startswith(("†", "[ ]")) for note in notes(RUNS[1:], []))
