@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chronoscene.arrays import Array, Mask
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference, HeightKind, median_longitude
+from chronoscene.io.wording import counted
 from chronoscene.registration.photos.photo import Capture
 
 GROSS_FACTOR = 20.0
@@ -16,6 +17,9 @@ GROSS_FACTOR = 20.0
 Nearer ones are judged once there are poses to compare with."""
 
 GROSS_METRES = 200.0  # No position nearer to the median position is a gross error
+
+MOST = 0.8
+"""Share of the photos of a period that state both heights, from which take-off has a height."""
 
 CONSTANT_METRES = 0.5
 """Positions that all lie within this distance do not describe the motion of the camera."""
@@ -93,15 +97,33 @@ def _heights(captures: Sequence[Capture], has: Mask) -> tuple[Array, HeightKind,
     stated, relative = (_stated(captures, name) for name in ("altitude", "relative_altitude"))
     known = np.isfinite(stated)
     missing = int((has & ~known).sum())
-    if not missing:
-        return stated, "as stated", []
+    filled = _fill(stated, relative, has, np.array([c.period for c in captures]))
+    remarks = []
+    if given := int((np.isfinite(filled) & ~known).sum()):
+        remarks = [f"{counted(given, 'height')} above take-off made absolute by the other photos"]
+    if np.isfinite(filled[has]).all():
+        return filled, "as stated", remarks
     if np.isfinite(relative[has]).all():
         remark = f"heights are relative to take-off: {missing} photos state no others"
         return relative, "relative", [remark]
     if known.sum() >= 0.5 * has.sum():
-        filled = np.where(known, stated, np.nanmedian(stated))
-        return filled, "as stated", [f"{missing} photos state no height: the median is used"]
+        remarks.append(f"{missing - given} photos state no height: the median is used")
+        filled = np.where(np.isfinite(filled), filled, np.nanmedian(stated))
+        return filled, "as stated", remarks
     return np.zeros(len(captures)), "none", ["most photos state no height: 0 is used for all"]
+
+
+def _fill(stated: Array, relative: Array, has: Mask, period: Ints) -> Array:
+    """Absolute heights of photos with a relative one, where most of their period state both. [N]"""
+    filled = stated.copy()
+    for one in np.unique(period[has]):
+        mine = has & (period == one)
+        take_off = (stated - relative)[mine]
+        both = np.isfinite(take_off)
+        if both.mean() >= MOST:
+            absolute = relative + np.median(take_off[both])
+            filled = np.where(mine & ~np.isfinite(stated), absolute, filled)
+    return filled
 
 
 def _plausible(captures: Sequence[Capture], enu: Array, has: Mask) -> tuple[Mask, list[str]]:

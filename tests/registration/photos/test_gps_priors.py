@@ -1,5 +1,6 @@
 """GPS to metres, and which positions are plausible."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from chronoscene.geodesy import Georeference
 from chronoscene.images.exif import ExifData
+from chronoscene.io.wording import counted
 from chronoscene.registration.photos.gps_priors import locate
 from chronoscene.registration.photos.photo import Capture, Gps
 
@@ -116,6 +118,31 @@ def test_heights_are_of_one_kind() -> None:
     assert none.georeference is not None
     assert none.georeference.height_kind == "none"
     assert (none.sigma[:, 2] >= 100.0).all()
+
+
+def test_few_missing_heights_follow_from_those_above_take_off() -> None:
+    relative: list[float | None] = [60.0 + i for i in range(20)]
+    stated: list[float | None] = [460.0 + i for i in range(20)]
+    for count, kind in ((1, "as stated"), (4, "as stated"), (5, "relative")):
+        few = [None if i < count else height for i, height in enumerate(stated)]
+        found = locate(captures(GRID, altitudes=few, relative=relative))
+        assert found.georeference is not None
+        assert found.georeference.height_kind == kind
+        remark = f"{counted(count, 'height')} above take-off made absolute by the other photos"
+        assert (remark in found.remarks) == (kind == "as stated")
+        heights = found.enu[:, 2] + found.georeference.height
+        expected = relative if kind == "relative" else stated
+        np.testing.assert_allclose(heights, np.array(expected, np.float64), atol=0.01)
+
+
+def test_missing_heights_follow_from_the_take_off_of_their_period() -> None:
+    relative: list[float | None] = [60.0] * 20
+    stated = [460.0 if i < 10 else 490.0 for i in range(20)]
+    few = [None if i in (0, 10) else height for i, height in enumerate(stated)]
+    photos = captures(GRID, altitudes=few, relative=relative)
+    found = locate([replace(c, period=i // 10) for i, c in enumerate(photos)])
+    whole = locate(captures(GRID, altitudes=[*stated]), found.georeference)
+    np.testing.assert_allclose(found.enu, whole.enu, atol=1e-6)
 
 
 def test_a_given_frame_is_used() -> None:
