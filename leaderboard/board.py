@@ -12,10 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats import read_scene
+from chronoscene.formats import DetectedFormat, detect
 from chronoscene.harness.files.ground_truth import freeze_ground_truth, ground_truth_folder
+from chronoscene.harness.files.protocols import PROTOCOLS
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.records import RunRecord
+from chronoscene.harness.files.source import read_bench_scene
 from chronoscene.io.processes import Report
 from chronoscene.metrics.registry import Scorers, make_scorers
 from chronoscene.scene import Scene
@@ -32,6 +34,8 @@ NO_ENTRY = (
     "--dataset-format, give these, or name the scene that chronoscene convert makes with them"
 )
 """Notice on a scene that was named in vain."""
+
+_Hashes = tuple[str, str]  # Of a scene and of its split
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +86,8 @@ def read_board(
     board = Board()
     found: dict[tuple[object, ...], tuple[Path, Standing]] = {}
     with tempfile.TemporaryDirectory() as temporary:
-        read = [(path, read_scene(path, format=format, period_by=period_by)) for path in scenes]
-        truths = _Truths(read, Path(temporary))
+        given = [(path, detect(path, format=format, period_by=period_by)) for path in scenes]
+        truths = _Truths(given, Path(temporary))
         files = entry_files(folder)
         for number, path in enumerate(files):
             if progress is not None:
@@ -134,24 +138,39 @@ def _stand(path: Path, entry: MeasuredEntry, truths: _Truths) -> Standing:
 class _Truths:
     """Scenes that entries are verified with, and their frozen test photos."""
 
-    def __init__(self, scenes: Iterable[tuple[Path, Scene]], folder: Path) -> None:
+    def __init__(self, given: Iterable[tuple[Path, DetectedFormat]], folder: Path) -> None:
         self._folder = folder
-        self._scenes: dict[tuple[str, str], Scene] = {}
-        self._idle: dict[tuple[str, str], Path] = {}
-        for path, scene in scenes:
-            hashes = scene_hash(scene), split_hash(scene)
-            self._scenes[hashes], self._idle[hashes] = scene, path
+        self._given = dict(given)
+        self._scenes: dict[int, dict[_Hashes, Scene]] = {}
+        self._hashes: dict[Path, set[_Hashes]] = {path: set() for path in self._given}
+        self._used: set[_Hashes] = set()
         self._scorers: dict[frozenset[str], Scorers] = {}
+        self._read(shrink=1)
+
+    def _read(self, shrink: int) -> dict[_Hashes, Scene]:
+        """Read all scenes as bench does, once for each divisor of the size of their images."""
+        if shrink not in self._scenes:
+            scenes: dict[_Hashes, Scene] = {}
+            for path, found in self._given.items():
+                scene = read_bench_scene(found, validation=False, shrink=shrink)
+                hashes = scene_hash(scene), split_hash(scene)
+                scenes[hashes] = scene
+                self._hashes[path].add(hashes)
+            self._scenes[shrink] = scenes
+        return self._scenes[shrink]
 
     def scene_of(self, run: RunRecord) -> Scene | None:
         hashes = run.scene_hash, run.split_hash
-        self._idle.pop(hashes, None)
-        return self._scenes.get(hashes)
+        protocol = PROTOCOLS.get(run.protocol)
+        scene = self._read(protocol.shrink if protocol else 1).get(hashes)
+        if scene is not None:
+            self._used.add(hashes)
+        return scene
 
     @property
     def idle(self) -> list[Path]:
         """Folders of scenes that no entry is of."""
-        return [*self._idle.values()]
+        return [path for path, hashes in self._hashes.items() if not hashes & self._used]
 
     def freeze(self, scene: Scene, run: RunRecord) -> Path:
         """Write the test photos of a scene at the width of a run, unless they are there."""

@@ -69,12 +69,15 @@ def noisy() -> Callable[..., None]:
     return write_noisy
 
 
-def write_noisy(runs: Path, scene, method: str, seed: int, *, noise: int) -> None:
+def write_noisy(
+    runs: Path, scene, method: str, seed: int, *, noise: int, protocol: str = ""
+) -> None:
     """A run without scores, whose predictions are photos with noise."""
     hashes = {"scene_hash": scene_hash(scene), "split_hash": split_hash(scene)}
     run = record(
         method, seed, scene=scene.name, config_hash="c" * 64, max_width=1600, commit="1" * 40,
-        period_labels={str(p.id): p.label for p in scene.periods}, iterations=1000, **hashes,
+        period_labels={str(p.id): p.label for p in scene.periods}, iterations=1000,
+        protocol=protocol, **hashes,
     )  # fmt: skip
     truth = freeze_ground_truth(runs, scene, run.scene_hash, run.max_width)
     folder = runs / scene.name / f"{method}-joint-fast" / f"seed{seed}"

@@ -7,8 +7,9 @@ import pytest
 from command_line import run_command
 from PIL import Image
 
-from chronoscene.formats import read_scene
+from chronoscene.formats import detect, read_scene
 from chronoscene.harness.files.records import ViewScore
+from chronoscene.harness.files.source import read_bench_scene
 from chronoscene.harness.score.scoring import aggregate, rescore
 from chronoscene.harness.score.verification import verify
 from chronoscene.metrics.registry import make_scorers
@@ -95,6 +96,26 @@ def test_values_of_other_views_than_those_that_count_are_refused(
     if forgery != "values of the hidden view":
         found = f"no values of {other!r}, whose photo has pixels that count"
     assert found in board.notices[0]
+
+
+@pytest.mark.parametrize(("shrink", "verified"), [(4, 1), (1, 0)])
+def test_runs_under_a_protocol_are_verified_at_its_size(
+    make_scene_folder, noisy, tmp_path, shrink, verified
+):
+    names = [f"20{9 + i // 9:02d}-0{i % 9 + 1}-01_{i}.png" for i in range(18)]
+    folder, wall = make_scene_folder(dict.fromkeys(names, 0), name="plain"), tmp_path / "wall"
+    shutil.copytree(folder / "images", wall / "dense/images")
+    shutil.copytree(folder / "sparse/0", wall / "dense/sparse")
+    (wall / "annots").mkdir()
+    (wall / "annots/train.txt").write_text("\n".join(names))
+    found = detect(wall, format="neusc", period_by="year")
+    scene = read_bench_scene(found, validation=False, shrink=shrink)
+    noisy(tmp_path / "runs", scene, "3dgs", 0, noise=30, protocol="5pointz")
+    rescore(tmp_path / "runs", make_scorers(["psnr"]))
+    submit([tmp_path / "runs"], tmp_path / "entries")
+    board = read_board(tmp_path / "entries", [wall], format="neusc", period_by="year")
+    assert [not standing.claimed for standing in board.standings] == [bool(verified)]
+    assert board.notices == ([] if verified else [f"{wall}: {NO_ENTRY}"])
 
 
 def test_options_of_reading_need_a_scene(project, tmp_path):
