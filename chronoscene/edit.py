@@ -65,6 +65,8 @@ class Edited:
     points_outside: int
     points_unseen: int
     """Points that lost observations and have fewer than `MIN_VIEWS` left."""
+    renamed: bool
+    """True if periods or images have other names, also where ids in place of labels moved up."""
 
 
 def read_for_edit(detected: DetectedFormat, edits: Edits) -> tuple[Scene, Edits, int, int]:
@@ -170,6 +172,8 @@ def apply(scene: Scene, edits: Edits) -> Edited:
         images_outside=int(np.count_nonzero(kept & ~seeing)),
         points_outside=int(np.count_nonzero(~inside)),
         points_unseen=unseen,
+        renamed=bool(edits.rename)
+        or any(p.label != periods[number[p.id]].label for p in scene.periods if p.id in left),
     )
 
 

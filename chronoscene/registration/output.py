@@ -14,12 +14,12 @@ from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.masks import find_masks
-from chronoscene.io.staging import check_not_current, needing_space, write_text_atomic
+from chronoscene.io.staging import check_not_current, needing_space, replacing, write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
 from chronoscene.registration.quality.position import Position, judge_position
 from chronoscene.registration.quality.verdict import Verdict, judge
 from chronoscene.registration.report.certificate_json import to_json
-from chronoscene.registration.report.coordinates import CONTROL, write_control
+from chronoscene.registration.report.coordinates import CONTROL, GEOREFERENCE, write_control
 from chronoscene.registration.report.page import render_report
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import with_tie_tracks
@@ -141,6 +141,32 @@ def _copy(source: Path, near: Path, out: Path) -> None:
     except BaseException:
         shutil.rmtree(near, ignore_errors=True)
         raise
+
+
+def copy_records(scene: Scene, out: Path, *, certificate: bool = True) -> tuple[str, ...]:
+    """Copy what ``register`` wrote about a scene to another scene in the same frame.
+
+    That is ``georeference.json``, and the certificate if the scene was read with the periods that
+    it describes. Links that lead out of the scene are left out.
+
+    Args:
+        scene: Any scene.
+        out: Folder of the other one.
+        certificate: False if the other one has other names of periods or images.
+
+    Returns:
+        Names of the files that were copied.
+    """
+    described = certificate and scene.format == our_format.NAME
+    names = (GEOREFERENCE, CERTIFICATE) if described else (GEOREFERENCE,)
+    root, copied = scene.root.resolve(), list[str]()
+    for name in names:
+        source = (root / name).resolve()
+        if source.is_file() and source.is_relative_to(root):
+            with replacing(out / name) as partial:
+                shutil.copyfile(source, partial)
+            copied.append(name)
+    return tuple(copied)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

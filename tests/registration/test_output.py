@@ -3,11 +3,14 @@
 import errno
 import os
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from chronoscene.errors import DiskFullError
+from chronoscene.formats import read_scene
 from chronoscene.registration import output
 
 
@@ -24,3 +27,28 @@ def test_a_copy_to_a_full_disk_leaves_nothing(
     with pytest.raises(DiskFullError, match="out: expected space"):
         output._copy(tmp_path / "staged", tmp_path / ".out.partial", tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["staged"]
+
+
+def test_records_that_lead_out_of_the_scene_are_left_out(
+    make_scene_folder: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder, out = make_scene_folder(), tmp_path / "out"
+    out.mkdir()
+    (tmp_path / "secret").write_text("{}")
+    (folder / output.CERTIFICATE).symlink_to(tmp_path / "secret")
+    (folder / "frame.json").write_text("{}")
+    (folder / output.GEOREFERENCE).symlink_to("frame.json")
+    assert output.copy_records(read_scene(folder), out) == (output.GEOREFERENCE,)
+    (copy,) = out.iterdir()
+    assert copy.read_text() == "{}" and not copy.is_symlink()
+
+
+def test_a_certificate_is_about_the_periods_of_the_scene_itself(
+    make_scene_folder: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder = make_scene_folder()
+    (folder / output.CERTIFICATE).touch()
+    scene = read_scene(folder)
+    assert not output.copy_records(replace(scene, format="colmap-folders"), tmp_path)
+    assert not output.copy_records(scene, tmp_path, certificate=False)
+    assert output.copy_records(scene, tmp_path) == (output.CERTIFICATE,)

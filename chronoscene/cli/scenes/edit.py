@@ -17,6 +17,7 @@ from chronoscene.edit import MIN_VIEWS, Box, Edited, Edits, edit, read_for_edit
 from chronoscene.errors import ConfigError
 from chronoscene.formats import detect
 from chronoscene.io.wording import counted
+from chronoscene.registration.output import CERTIFICATE, copy_records
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
 
@@ -79,8 +80,16 @@ def command(
     done = replace(  # with what was left out when the scene was read
         done, images_dropped=done.images_dropped + images, points_unseen=done.points_unseen + points
     )
+    copied = copy_records(scene, out, certificate=not done.renamed)
     emit(report(done))
-    for note in (*detected.notes, *remarks_on(scene), *obstacles(done.scene), *_poor(done.scene)):
+    notes = [*detected.notes]
+    if done.renamed and (scene.root / CERTIFICATE).is_file():
+        notes.append(
+            f"{CERTIFICATE} is not copied: a certificate does not describe a scene whose periods "
+            "or images have other names"
+        )
+        copied = (*copied, CERTIFICATE)  # one note on it is enough
+    for note in (*notes, *remarks_on(scene, copied), *obstacles(done.scene), *_poor(done.scene)):
         show_note(note)
 
 

@@ -19,6 +19,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.exif import capture_times
 from chronoscene.io.staging import check_outside, write_text_atomic
+from chronoscene.registration.output import copy_records
 from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, SplitSettings, make_split
 
 
@@ -95,16 +96,18 @@ def command(
     split = make_split(scene, settings, capture_times(scene.images_root, names))
     for frame in split.scene.frames:
         our_format.check_writable_name(source, frame)
+    notes: list[str] = []
     if scene_out is not None:
         with progress_bar() as bar:
             our_format.write(
                 split.scene, scene_out, image_source="link", progress=partial(bar, "images")
             )
         _write(split, scene_out / our_format.TEST, "--scene-out")
+        notes = remarks_on(scene, copy_records(scene, scene_out))
     if out is not None:
         _write(split, out, "OUT")
     emit(report(split))
-    for note in remarks_on(scene) if scene_out is not None else ():
+    for note in notes:
         show_note(note)
 
 

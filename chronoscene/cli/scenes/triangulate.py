@@ -13,6 +13,7 @@ from chronoscene.cli.scenes.reading import LINKS, describe, show_note
 from chronoscene.convert import obstacles, remarks_on
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import detect
+from chronoscene.registration.output import copy_records
 from chronoscene.registration.triangulation import Triangulated, triangulate
 
 
@@ -56,8 +57,9 @@ def command(
             model=None if place is None else source / place,
             report=report,
         )
+    copied = copy_records(scene, out)
     emit(summary(done, out))
-    for note in (*detected.notes, *remarks_on(scene), *obstacles(done.scene)):
+    for note in (*detected.notes, *remarks_on(scene, copied), *obstacles(done.scene)):
         show_note(note)
 
 

@@ -15,6 +15,7 @@ from chronoscene.convert import remarks_on
 from chronoscene.images.undistortion import CameraChange
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted
+from chronoscene.registration.output import copy_records
 from chronoscene.scene.splits import split_hash
 from chronoscene.undistort import Undistortion, undistort
 
@@ -63,8 +64,9 @@ def command(
             image_source=LINKS[link],
             progress=partial(bar, "images"),
         )
+    copied = copy_records(scene, out)
     emit(report(done))
-    for note in remarks_on(scene):
+    for note in remarks_on(scene, copied):
         show_note(note)
 
 

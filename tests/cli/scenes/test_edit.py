@@ -3,7 +3,10 @@
 import pytest
 from command_line import invoke, refused
 
+from chronoscene.cli.scenes import triangulate
+from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
+from chronoscene.registration.triangulation import Triangulated
 
 
 def test_says_what_is_left(make_scene_folder, tmp_path):
@@ -58,3 +61,54 @@ def test_photos_without_common_features(make_scene_folder, tmp_path):
     assert "at least 50 points, found 0: " in lines[-1] and "add images that overlap" in lines[-1]
     assert "was kept" in lines[-2]
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def registered(make_scene_folder):
+    """Three periods, and what a registration writes beside the scene; labels are ids."""
+    folder = make_scene_folder({f"{p}/{i}.png": j for j, p in enumerate("abc") for i in range(3)})
+    for name in ("georeference.json", "registration.json", "registration.html"):
+        (folder / name).write_text(f"{name} of register")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("options", "kept"),
+    [
+        (("--drop", "a/0.png"), True),
+        (("--keep-period", "0", "--keep-period", "1"), True),
+        (("--crop=-100,-100,-100,100,100,100",), True),
+        (("--rename", "0=before"), False),
+        (("--rename", "0=x", "--rename", "1=x"), False),
+        (("--rename", "a/0.png=b/9.png"), False),
+        (("--drop-period", "0"), False),  # periods 1 and 2 are now labelled 0 and 1
+    ],
+)
+def test_records_of_a_registration_come_along(registered, tmp_path, options, kept):
+    result = invoke("edit", registered, tmp_path / "out", *options)
+    assert result.exit_code == 0, result.output
+    frame, certificate = (
+        tmp_path / "out" / f"{name}.json" for name in ("georeference", "registration")
+    )
+    assert frame.read_text() == "georeference.json of register"
+    assert certificate.exists() == kept
+    assert ("note: registration.json is not copied: a certificate" in result.stderr) != kept
+    assert "and not converted: registration.html\n" in result.stderr
+
+
+def test_no_certificate_no_note(make_scene_folder, tmp_path):
+    result = invoke("edit", make_scene_folder(), tmp_path / "out", "--rename", "0=before")
+    assert "registration.json" not in result.stderr
+
+
+def test_triangulate_takes_the_records_of_a_registration_along(registered, tmp_path, monkeypatch):
+    def stand_in(scene, out, **_):
+        our_format.write(scene, out)
+        return Triangulated(read_scene(out), 1, 1, 1)
+
+    monkeypatch.setattr(triangulate, "triangulate", stand_in)
+    result = invoke("triangulate", registered, tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    for name in ("georeference.json", "registration.json"):
+        assert (tmp_path / "out" / name).read_text() == f"{name} of register"
+    assert "and not converted: registration.html\n" in result.stderr

@@ -128,3 +128,12 @@ def test_scene_out_names_what_is_left_out(scene, tmp_path):
     note = "note: not part of the format, and not converted: gt/\n"
     assert note in run(scene, "--scene-out", tmp_path / "new").stderr
     assert note not in run(scene, tmp_path / "test.txt").stderr
+
+
+def test_scene_out_has_the_records_of_a_registration(scene, tmp_path):
+    for name in ("georeference.json", "registration.json"):
+        (scene / name).write_text(f"{name} of register")
+    result = run(scene, "--scene-out", tmp_path / "new")
+    assert "not converted" not in result.stderr
+    for name in ("georeference.json", "registration.json"):
+        assert (tmp_path / "new" / name).read_text() == f"{name} of register"

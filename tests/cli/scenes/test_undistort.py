@@ -80,3 +80,12 @@ def test_links(make_scene_folder, tmp_path, link, is_symlink):
     for frame in read_scene(out).frames:
         path = out / "images" / frame.name
         assert path.samefile(folder / "images" / frame.name) and path.is_symlink() == is_symlink
+
+
+def test_records_of_a_registration_come_along(distorted, tmp_path):
+    for name in ("georeference.json", "registration.json"):
+        (distorted / name).write_text(f"{name} of register")
+    result = run(distorted, tmp_path / "out")
+    assert "not converted" not in result.stderr
+    for name in ("georeference.json", "registration.json"):
+        assert (tmp_path / "out" / name).read_text() == f"{name} of register"
