@@ -31,7 +31,9 @@ function stateFrom(address, scene, problems) {
     return undefined;
   };
   state.period = number("period", last, "period");
-  state.run = number("run", scene.runs.length - 1, "run", Number.isInteger);
+  // Addresses leave out the first run.
+  state.run = values.has("run")
+    ? number("run", scene.runs.length - 1, "run", Number.isInteger) : 0;
   state.wipe = number("wipe", 1, "the wipe at");
   const mode = values.get("mode");
   if (["wipe", "blink"].includes(mode)) state.mode = mode;
