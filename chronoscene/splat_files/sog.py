@@ -85,26 +85,28 @@ def decode(data: bytes) -> GaussianCloud:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         meta: dict[str, Any] = json.loads(archive.read("meta.json"))
         images = {
-            name: np.asarray(Image.open(io.BytesIO(archive.read(name))))
+            # WebP leaves out an alpha channel that is 255 throughout.
+            name: np.asarray(Image.open(io.BytesIO(archive.read(name))).convert("RGBA"))
             for name in archive.namelist()
             if name != "meta.json"
         }
     count = meta["count"]
 
-    def pixels(name: str) -> NDArray[np.int64]:
-        return images[name].reshape(-1, images[name].shape[2])[:count].astype(np.int64)
+    def pixels(name: str, channels: int) -> NDArray[np.int64]:
+        return images[name].reshape(-1, 4)[:count, :channels].astype(np.int64)
 
     low, high = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
-    levels = pixels("means_l.webp") + (pixels("means_u.webp") << 8)
+    levels = pixels("means_l.webp", 3) + (pixels("means_u.webp", 3) << 8)
     log_means = low + levels / 65535 * (high - low)
-    colours, labels = pixels("sh0.webp"), pixels("shN_labels.webp")
-    palette = np.array(meta["shN"]["codebook"])[images["shN_centroids.webp"]].reshape(-1, 15, 3)
+    colours, labels = pixels("sh0.webp", 4), pixels("shN_labels.webp", 2)
+    entries = images["shN_centroids.webp"][..., :3]
+    palette = np.array(meta["shN"]["codebook"])[entries].reshape(-1, 15, 3)
     dc = np.array(meta["sh0"]["codebook"])[colours[:, :3]]
     rest = palette[labels[:, 0] + (labels[:, 1] << 8)]
     return GaussianCloud(
         means=(np.sign(log_means) * np.expm1(np.abs(log_means))).astype(np.float32),
-        quats=_unpack_rotations(pixels("quats.webp")),
-        scales=np.exp(np.array(meta["scales"]["codebook"], np.float32)[pixels("scales.webp")]),
+        quats=_unpack_rotations(pixels("quats.webp", 4)),
+        scales=np.exp(np.array(meta["scales"]["codebook"], np.float32)[pixels("scales.webp", 3)]),
         opacities=(colours[:, 3] / 255).astype(np.float32),
         sh_coeffs=np.concatenate([dc[:, None], rest], axis=1).astype(np.float32),
     )

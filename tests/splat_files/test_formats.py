@@ -160,6 +160,15 @@ def test_colours_of_transparent_gaussians_survive_webp():
     assert np.abs(read.sh_coeffs[:, 0] - cloud.sh_coeffs[:, 0]).max() < 0.02
 
 
+def test_images_of_sog_that_are_opaque_throughout_are_read():
+    cloud = make_cloud(16)  # fill 4 x 4 pixels
+    cloud.opacities[:] = 1
+    cloud.quats[:] = 0, 0, 0, 1  # 255 says that z is left out
+    read = sog.decode(sog.encode(cloud))
+    assert (read.opacities == 1).all()
+    np.testing.assert_allclose(shapes(read), shapes(cloud), atol=0.03)
+
+
 @pytest.mark.parametrize("kind", SUFFIXES)
 def test_one_gaussian_alone_makes_a_file(kind):
     cloud = make_cloud(1)
