@@ -36,7 +36,7 @@ def encode(kind: str, cloud: GaussianCloud, *, antialiased: bool, up: ArrayLike)
         case "spz":
             return spz.encode(cloud, antialiased=antialiased)
         case "sog":
-            return sog.encode(cloud)
+            return sog.encode(cloud, antialiased=antialiased)
         case "splat":
             return splat.encode(cloud)
         case "gltf":

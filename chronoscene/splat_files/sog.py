@@ -33,8 +33,13 @@ _ROUNDS = 6
 """Rounds of k-means."""
 
 
-def encode(cloud: GaussianCloud) -> bytes:
-    """Make a file."""
+def encode(cloud: GaussianCloud, *, antialiased: bool) -> bytes:
+    """Make a file.
+
+    Args:
+        cloud: One Gaussian at least.
+        antialiased: Whether a viewer is to draw with the filter of Mip-Splatting.
+    """
     log_means = np.sign(cloud.means) * np.log1p(np.abs(cloud.means.astype(np.float64)))
     low, high = log_means.min(axis=0), log_means.max(axis=0)
     levels = np.rint((log_means - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.uint16)
@@ -61,6 +66,7 @@ def encode(cloud: GaussianCloud) -> bytes:
         "version": 2,
         "asset": {"generator": "ChronoScene", "comments": []},
         "count": len(cloud),
+        "antialias": antialiased,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": files[:2]},
         "scales": {"codebook": scale_table, "files": files[2:3]},
         "quats": {"files": files[3:4]},
