@@ -130,7 +130,7 @@ def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list
         name = transforms.image_name(where, path, folder, frame.get("file_path"))
         world_from_cam = transforms.matrix(where, frame.get("transform_matrix"))
         pose = transforms.pose_from_opengl(where, world_from_cam)
-        camera = cameras.camera(where, {**shared, **frame}, path / name)
+        camera = cameras.camera(where, transforms.frame_keys(shared, frame), path / name)
         images.append(PosedImage(0, name, camera, pose))
     return images
 

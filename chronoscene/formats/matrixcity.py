@@ -213,7 +213,7 @@ def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[PosedIm
             world_from_cam[:3, 3] *= PREPARED_UNIT
             file_path = frame.get("file_path")
         name = transforms.image_name(where, path, file.folder, file_path)
-        keys = shared | frame
+        keys = transforms.frame_keys(shared, frame)
         if "w" not in keys or "h" not in keys:  # images of a block are of one size
             known = images[0].camera if images else None
             size = (known.width, known.height) if known else image_size(path / name)

@@ -169,7 +169,7 @@ def _read_images(file: _Document) -> list[PosedImage]:
         if not os.path.isfile(path):
             continue
         world_from_cam = transforms.matrix(place, frame.get("transform_matrix"), (3, 4))
-        camera = cameras.camera(place, {**shared, **frame}, path)
+        camera = cameras.camera(place, transforms.frame_keys(shared, frame), path)
         pose = transforms.pose_from_opengl(place, world_from_cam)
         image_id = frame.get("colmap_im_id")
         images.append(PosedImage(image_id if type(image_id) is int else 0, name, camera, pose))

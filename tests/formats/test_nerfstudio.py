@@ -100,6 +100,38 @@ def test_frames_of_equal_intrinsics_share_a_camera(nerfstudio_folder):
     assert len({c.camera_id for c in cameras}) == len(set(cameras)) == 2
 
 
+@pytest.mark.parametrize(
+    ("of_file", "of_frame", "focals"),
+    [
+        ({"fl_x": 50, "fl_y": 50}, {"camera_angle_x": np.pi / 2}, (32, 32)),
+        ({"fl_x": 50, "fl_y": 50}, {"camera_angle_y": np.pi / 2}, (50, 24)),
+        ({"camera_angle_x": 1, "camera_angle_y": 2}, {"camera_angle_x": np.pi / 2}, (32, 32)),
+        ({"camera_angle_x": 1}, {"fl_x": 60}, (60, 60)),
+        ({"fl_x": 50}, {"camera_angle_x": np.pi / 2, "fl_y": 51}, (32, 51)),
+        ({"fl_x": 50}, {"camera_angle_x": None}, (50, 50)),
+    ],
+)
+def test_the_focal_length_of_a_frame_overrides_that_of_the_file(
+    nerfstudio_folder, of_file, of_frame, focals
+):
+    folder = nerfstudio_folder(NAMES)
+    edit(folder, **{"fl_x": None, "fl_y": None, "w": 64, "h": 48, **of_file})
+    edit_frames(folder, lambda i, frame: frame.update(of_frame if i == 0 else {}))
+    camera = read_scene(folder).frames[-1].camera  # the file has them in reverse
+    assert (camera.K[0, 0], camera.K[1, 1]) == pytest.approx(focals)
+
+
+def test_the_distortion_of_a_frame_overrides_that_of_the_file(nerfstudio_folder):
+    folder = nerfstudio_folder(NAMES)
+    edit(folder, is_fisheye=True, distortion_params=[0.1, 0, 0, 0])
+    edit_frames(
+        folder, lambda i, frame: i == 0 and frame.update(camera_model="OPENCV", k1=0.2, k2=0.3)
+    )
+    *_, other, first = (f.camera for f in read_scene(folder).frames)  # reversed in the file
+    assert (first.model, first.params[4:]) == ("OPENCV", (0.2, 0.3, 0, 0))
+    assert (other.model, other.params[4:]) == ("OPENCV_FISHEYE", (0.1, 0, 0, 0))
+
+
 def test_periods_from_times(nerfstudio_folder):
     folder = nerfstudio_folder(NAMES, periods=False)
     edit_frames(folder, lambda i, frame: frame.update(time=[0.5, 0.25, 0.5, 0.25][i]))

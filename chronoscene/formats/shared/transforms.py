@@ -44,6 +44,14 @@ MODEL_KEYS = {
 
 _LIST_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")  # Order of ``distortion_params``
 
+_REPLACES = {
+    "camera_angle_x": ("fl_x", "fl_y", "camera_angle_y"),  # alone, it means square pixels
+    "camera_angle_y": ("fl_y",),
+    "camera_model": ("is_fisheye",),
+    **dict.fromkeys(_LIST_ORDER, ("distortion_params",)),
+}
+"""Keys of a frame, with those of a file that say the same and would otherwise go first."""
+
 
 def read_frames(place: Path, data: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the list ``frames``, which has at least one object."""
@@ -56,6 +64,13 @@ def read_frames(place: Path, data: Mapping[str, Any]) -> list[dict[str, Any]]:
 def shared_keys(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a file that hold for all frames."""
     return {key: value for key, value in data.items() if key != "frames"}
+
+
+def frame_keys(shared: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a frame, and those of its file that the frame does not override."""
+    own = (keys for key, keys in _REPLACES.items() if frame.get(key) is not None)
+    replaced = {key for keys in own for key in keys}
+    return {key: value for key, value in shared.items() if key not in replaced} | dict(frame)
 
 
 def file_name(place: object, folder: str, file_path: object) -> str:
@@ -205,7 +220,7 @@ class CameraTable:
 
         Args:
             place: For messages.
-            data: Keys of the file, overridden by those of the frame.
+            data: Keys of the frame and its file; see `frame_keys`.
             image: File from which the size is read if the keys lack it.
         """
         width, height = _size(place, data, image)
