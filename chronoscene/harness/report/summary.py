@@ -397,8 +397,8 @@ def published_entries(table: PublishedTable, scenes: Iterable[str]) -> DataFrame
 
     rows = []
     for scene in scenes:
-        name = scene_of(scene).casefold()
-        for row in (r for r in table.rows if r.scene.casefold() == name):
+        printed = scene_of(scene).casefold()
+        for row in (r for r in table.rows if r.scene.casefold() == printed):
             values = [(name, "macro", getattr(row, name)) for name in PAPER_METRICS]
             values.append((SIZE, "", table.memory_gb[row.group][row.method] * 1e9))
             rows += [(scene, row.method, *value) for value in values]

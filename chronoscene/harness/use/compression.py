@@ -303,16 +303,17 @@ def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, truth
         period = frame.period
         writer.add(frame.name, image, camera_period=period, rendered_period=period)
     writer.close_run(run.record)
+    same = device == run.record.device
+    absent = dict(run.record.absent)
+    if frames and not same:
+        absent["render_seconds"] = f"compressed on another device than that of the run: {device}"
     changed = {
         "variant": variant,
         "checkpoint_bytes": size_of(run.folder / CHECKPOINT),
         "config_hash": read_config(run.folder)["config_hash"],
-        "render_seconds": seconds / len(frames) if frames else None,
+        "render_seconds": seconds / len(frames) if frames and same else None,
+        "absent": absent,
     }
-    if frames and device != run.record.device:
-        changed["render_seconds"] = None
-        reason = f"compressed on another device than that of the run: {device}"
-        changed["absent"] = run.record.absent | {"render_seconds": reason}
     score_run(run.folder, run.record.model_copy(update=changed), truth, make_scorers())
 
 

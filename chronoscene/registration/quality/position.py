@@ -326,15 +326,17 @@ def _words(
     if level == "pass" and left_out is not None:
         return f"Control points, each without its own coordinates in turn: {left_out.text}."
     first = objections[0]
-    start = (
-        "The surveyed points and GPS contradict each other; one of the two is wrong."
-        if level == "fail" and first.check == "gps"
-        else "The model does not lie where surveyed points are."
-        if level == "fail"
-        else "The model contradicts what its photos state; its lengths and heights may be wrong."
-        if first.check == "metadata"
-        else "The position may be correct, but nothing independent proves it."
-        if first.check == "independent"
-        else "The position is not proven to the precision of the photos."
-    )
+    match level, first.check:
+        case "fail", "gps":
+            start = "The surveyed points and GPS contradict each other; one of the two is wrong."
+        case "fail", _:
+            start = "The model does not lie where surveyed points are."
+        case _, "metadata":
+            start = (
+                "The model contradicts what its photos state; its lengths and heights may be wrong."
+            )
+        case _, "independent":
+            start = "The position may be correct, but nothing independent proves it."
+        case _:
+            start = "The position is not proven to the precision of the photos."
     return f"{start} {first.place[0].upper()}{first.place[1:]}: {first.found}."

@@ -52,6 +52,14 @@ def test_bad_options(tmp_path: Path, option: list[str], place: str) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("size", ["320", "-4x10"])
+def test_a_size_that_is_none_is_a_usage_error(tmp_path: Path, size: str) -> None:
+    result = invoke("synth", tmp_path / "out", "--size", size)
+    assert result.exit_code == 2
+    assert "'--size': expected WIDTHxHEIGHT, such as 320x240" in result.output
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_folder_in_use(tmp_path: Path) -> None:
     (tmp_path / "a.txt").touch()
     with pytest.raises(SceneError, match="choose another folder"):
