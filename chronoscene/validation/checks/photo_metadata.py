@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Mask
 from chronoscene.errors import ChronoSceneError
 from chronoscene.geodesy import Georeference, median_longitude
 from chronoscene.scene.grouping import grouped
@@ -21,6 +22,7 @@ MUCH_NEARER = 0.25
 """A photo is of another period if its date is within this share of the distance to its own."""
 
 MIN_PHOTOS = 6  # Photos with a position from which a similarity is meaningful
+HEIGHT_ROUNDS = 10  # With heights of up to 0.6 of the spread, the scale is then within 0.1 %
 MIN_SPREAD = 10.0  # Metres; smaller spreads of positions are the noise of the receiver
 
 
@@ -98,14 +100,29 @@ def fit_gps(scene: RawScene) -> GpsFit | None:
     if len(rows) < MIN_PHOTOS:
         return None
     latitude, longitude, altitude = np.array(places, np.float64).T
-    # Another height than that of the rest would tilt the fit, and change its scale.
-    known = altitude[np.isfinite(altitude)]
-    altitude = np.where(np.isfinite(altitude), altitude, np.median(known) if len(known) else 0.0)
+    unknown = ~np.isfinite(altitude)
+    altitude[unknown] = 0.0 if unknown.all() else np.median(altitude[~unknown])
     middle = (float(np.median(latitude)), median_longitude(longitude), float(np.median(altitude)))
     target = Georeference(*middle, "as stated").to_enu(latitude, longitude, altitude)
     spread = float(np.median(np.linalg.norm(target[:, :2], axis=1)))
-    found = fit_robustly(scene.centres[rows], target, axes=2) if spread >= MIN_SPREAD else None
+    found = _fit(scene.centres[rows], target, unknown) if spread >= MIN_SPREAD else None
     if found is None:
         return None
     sigma = SIGMA * float(np.median(found[1]))
     return GpsFit(np.array(rows, np.int64), found[0], found[1], sigma, spread)
+
+
+def _fit(source: Array, target: Array, unknown: Mask) -> tuple[Similarity, Array] | None:
+    """Fit positions, of which some have no height: it is guessed, then that of the fit before.
+
+    Wrong heights would tilt the fit, and change its scale.
+
+    Source: the algorithm of Green and Gower 1979 for a Procrustes problem with a projection.
+    """
+    found = fit_robustly(source, target, axes=2)
+    for _ in range(HEIGHT_ROUNDS if unknown.any() else 0):
+        if found is None:
+            break
+        target[unknown, 2] = found[0].apply(source)[unknown, 2]
+        found = fit_robustly(source, target, axes=2)
+    return found
