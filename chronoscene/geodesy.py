@@ -22,6 +22,9 @@ from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 
 STEP = 10.0
 """Metres to either side over which a projection is differentiated: curvature cancels out."""
+WGS84 = "EPSG:4326"
+USUAL_ACCURACY = 1.0
+"""Metres. No national system has a better conversion to WGS 84, of which there are several."""
 
 HeightKind = Literal["as stated", "relative", "none"]
 
@@ -97,8 +100,27 @@ class ReferenceSystem:
         x, y, z = _to_wgs84(self.text).transform(longitude, latitude, height, direction=inverse)
         return np.column_stack([x, y, z / self.unit])
 
-    def remark_on(self, frame: Georeference) -> str | None:
-        """Return a remark if the origin of a frame is outside of the area of the system.
+    def to_geodetic(self, place: Array) -> tuple[float, float]:
+        """Latitude and longitude of coordinates in this system, degrees. [3]"""
+        longitude, latitude = _to_wgs84(self.text).transform(place[0], place[1])
+        return float(latitude), float(longitude)
+
+    def remarks_at(self, latitude: float, longitude: float, source: str = WGS84) -> list[str]:
+        """List reasons for which coordinates, converted from another system, are not exact.
+
+        Args:
+            latitude: Of the place, degrees.
+            longitude: Of the place, degrees.
+            source: The other system.
+        """
+        if not np.isfinite([latitude, longitude]).all():
+            return []
+        outside = self._outside(latitude, longitude)
+        found = outside or self._inexact(latitude, longitude, source)
+        return [] if found is None else [found]
+
+    def _outside(self, latitude: float, longitude: float) -> str | None:
+        """Return a remark if a place is outside of the area of the system.
 
         Its coordinates are as PROJ computes them there: distorted, or far off without a sign of it.
         None inside, and for a system without an area.
@@ -109,13 +131,31 @@ class ReferenceSystem:
         if area is None:
             return None
         width = (area.east - area.west) % 360 or 360
-        east = (frame.longitude - area.west) % 360 <= width
-        if east and area.south <= frame.latitude <= area.north:
+        if (longitude - area.west) % 360 <= width and area.south <= latitude <= area.north:
             return None
         return (
-            f"the scene is at {frame.latitude:.4f} north, {frame.longitude:.4f} east, outside of "
+            f"the scene is at {latitude:.4f} north, {longitude:.4f} east, outside of "
             f"the area of {self.text} ({area.south:g} to {area.north:g} north, {area.west:g} to "
             f"{area.east:g} east): coordinates in it may be distorted or wrong"
+        )
+
+    def _inexact(self, latitude: float, longitude: float, source: str) -> str | None:
+        """Return a remark if PROJ does not convert a system to this one as exactly as usual."""
+        from pyproj.aoi import AreaOfInterest
+
+        here = AreaOfInterest(longitude, latitude, longitude, latitude)
+        group = _conversions(source, self.text, here)
+        used, pair = group.transformers[0], f"between {source} and {self.text}"
+        if "Ballpark" in used.description:
+            return f"PROJ knows no conversion {pair} here and takes their datums for the same"
+        if used.accuracy <= USUAL_ACCURACY:
+            return None
+        better, best = "", group.unavailable_operations[:1]
+        if not group.best_available and 0 <= best[0].accuracy < used.accuracy:
+            better = f" ({best[0].accuracy:g} m with a grid: {_install(best[0])})"
+        return (
+            f"PROJ converts {pair} with an accuracy of {used.accuracy:g} m here{better}: "
+            f"coordinates may be off by as much, except with ground control given in {self.text}"
         )
 
     def derivative(self, frame: Georeference, enu: Array) -> Array:
@@ -137,7 +177,6 @@ def read_reference_system(
             it has heights of its own, or if PROJ lacks the grid that it needs.
     """
     import pyproj
-    from pyproj.transformer import TransformerGroup
 
     def wrong(found: str, todo: str) -> ChronoSceneError:
         expected = "a horizontal reference system that PROJ knows, such as EPSG:32632"
@@ -152,19 +191,17 @@ def read_reference_system(
         raise wrong(", which has heights above a geoid", todo)
     if not crs.is_geographic and not crs.is_projected:
         raise wrong(f", which is {crs.type_name.lower()}", "convert to a projected one")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns of what is refused below
-        try:
-            group = TransformerGroup(crs, "EPSG:4326", always_xy=True)
-        except IndexError as cause:  # pyproj wants to name a grid, and there is none
-            found = ", which PROJ does not convert to WGS 84 exactly"
-            raise wrong(found, "convert to a system on WGS 84") from cause
+    try:
+        group = _conversions(crs, WGS84)
+    except IndexError as cause:  # pyproj wants to name a grid, and there is none
+        found = ", which PROJ does not convert to WGS 84 exactly"
+        raise wrong(found, "convert to a system on WGS 84") from cause
     if not group.best_available:
-        grids = [g.short_name for op in group.unavailable_operations[:1] for g in op.grids]
-        install = "; ".join(f"pyproj sync --file {grid}" for grid in grids)
+        best = group.unavailable_operations[0]
+        grids = ", ".join(grid.short_name for grid in best.grids)
         raise wrong(
-            f", which PROJ converts exactly only with the grid {', '.join(grids)}",
-            f"install it ({install}), or convert to a system on WGS 84",
+            f", which PROJ converts exactly only with the grid {grids}",
+            f"install it ({_install(best)}), or convert to a system on WGS 84",
         )
     unit = float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected else 1.0
     axes = tuple(str(axis.direction) for axis in crs.axis_info[:2])
@@ -236,4 +273,18 @@ def _to_wgs84(crs: str) -> Any:
     """Transformer from a reference system to longitude and latitude in degrees."""
     import pyproj
 
-    return pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+    return pyproj.Transformer.from_crs(crs, WGS84, always_xy=True)
+
+
+def _conversions(source: Any, target: Any, area: Any = None) -> Any:
+    """Conversions between two systems that PROJ knows, the best ones first."""
+    from pyproj.transformer import TransformerGroup
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a grid that is not there
+        return TransformerGroup(source, target, always_xy=True, area_of_interest=area)
+
+
+def _install(operation: Any) -> str:
+    """Commands that install the grids of a conversion."""
+    return "; ".join(f"pyproj sync --file {grid.short_name}" for grid in operation.grids)

@@ -1,11 +1,14 @@
 """Geodetic positions to metres: against the closed form, and back."""
 
+import re
+
 import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.geodesy import (
+    WGS84,
     Georeference,
     from_crs,
     median_longitude,
@@ -158,12 +161,35 @@ def test_projected_coordinates_and_back() -> None:
         ("EPSG:32760", (-17.0, 179.0), (17.0, 179.0)),
         ("EPSG:3460", (-17.0, -179.5), (-17.0, 170.0)),  # Fiji, on both sides of 180 degrees
         ("EPSG:3857", (48.0, -179.0), (89.0, 9.0)),
-        ("+proj=utm +zone=32", (48.0, 9.0), None),
+        ("+proj=utm +zone=32 +datum=WGS84", (48.0, 9.0), None),
     ],
 )
 def test_a_place_outside_of_the_area_of_a_system(crs, inside, outside) -> None:
     system = read_reference_system("", crs)
-    assert system.remark_on(Georeference(*inside, 0.0, "as stated")) is None
+    assert not any("outside" in remark for remark in system.remarks_at(*inside))
     if outside is not None:
-        remark = system.remark_on(Georeference(*outside, 0.0, "as stated"))
-        assert remark is not None and crs in remark
+        (remark,) = system.remarks_at(*outside)
+        assert crs in remark
+
+
+@pytest.mark.parametrize(
+    ("crs", "place", "source", "expected"),
+    [
+        (
+            "EPSG:23030",
+            (40.0, -3.5),
+            WGS84,
+            r"accuracy of 1.5 m here \(1 m .* es_ign_SPED2ETV2.tif",
+        ),
+        ("EPSG:23030", (40.0, -3.5), "EPSG:25830", "between EPSG:25830 and .* 1.5 m"),
+        ("EPSG:6339", (38.0, -122.0), WGS84, "accuracy of 2 m here: coordinates may be"),
+        ("+proj=utm +zone=32 +ellps=bessel", (48.0, 9.0), WGS84, "takes their datums for the same"),
+        ("EPSG:25832", (48.0, 11.0), WGS84, None),
+        ("EPSG:23030", (40.0, -3.5), "EPSG:23030", None),
+        ("+proj=utm +zone=32 +ellps=bessel", (np.inf, np.inf), WGS84, None),
+    ],
+)
+def test_conversions_that_are_less_exact_than_usual(crs, place, source, expected) -> None:
+    remarks = read_reference_system("", crs).remarks_at(*place, source)
+    assert len(remarks) == (expected is not None)
+    assert expected is None or re.search(expected, remarks[0])

@@ -35,6 +35,8 @@ class MapFrame:
     """[3]"""
     error: float
     """Largest distance in metres from the projection itself, over all cameras."""
+    remarks: tuple[str, ...] = ()
+    """Reasons for which the coordinates are not exact."""
 
     @property
     def is_local(self) -> bool:
@@ -75,12 +77,12 @@ def map_frame(scene: Scene, crs: str | None) -> MapFrame:
     _check_world(scene, poses, crs)
     if scene.world.crs is None:
         return MapFrame(LOCAL, np.eye(3), np.zeros(3), error=0.0)
-    name, convert = _conversion(scene, scene.world.crs, crs)
     centres = camera_centre(poses)
     middle, steps = np.median(centres, axis=0), STEP * np.eye(3)
+    target, convert, remarks = _conversion(scene, middle, scene.world.crs, crs)
     matrix = (convert(middle + steps) - convert(middle - steps)).T / (2 * STEP)
     offset = convert(middle[None])[0] - matrix @ middle
-    made = MapFrame(name, matrix, offset, error=0.0)
+    made = MapFrame(target, matrix, offset, error=0.0, remarks=tuple(remarks))
     _check_scales(made)
     errors = convert(centres) - centres @ matrix.T - offset
     return replace(made, error=float(np.linalg.norm(errors, axis=1).max()))
@@ -131,25 +133,28 @@ def _check_world(scene: Scene, poses: Array, crs: str | None) -> None:
 
 
 def _conversion(
-    scene: Scene, world_crs: str, crs: str | None
-) -> tuple[str, Callable[[Array], Array]]:
-    """Name of the reference system of the map, and the transform of world coordinates to it."""
+    scene: Scene, middle: Array, world_crs: str, crs: str | None
+) -> tuple[str, Callable[[Array], Array], list[str]]:
+    """Name of the reference system of the map, the transform of world coordinates to it, and
+    remarks on it in the middle of the scene."""
     local, shift = from_crs(world_crs), np.asarray(scene.world.offset)
     if local is not None:
         target = read_projected("--crs", crs or _utm(local.latitude, local.longitude), metres=True)
-        return target.text, lambda xyz: target.from_local(local, xyz + shift)
+        remarks = target.remarks_at(local.latitude, local.longitude)
+        return target.text, lambda xyz: target.from_local(local, xyz + shift), remarks
     import pyproj
 
     todo = "correct crs in sparse/world.json; with null, products are in the metres of the scene"
     source = read_projected(str(scene.root), world_crs, metres=True, todo=todo)
     target = source if crs is None else read_projected("--crs", crs, metres=True)
     transform = pyproj.Transformer.from_crs(source.text, target.text, always_xy=True).transform
+    latitude, longitude = source.to_geodetic(middle + shift)
 
     def convert(xyz: Array) -> Array:
         east, north, height = (xyz + shift).T
         return np.column_stack([*transform(east, north), height])
 
-    return target.text, convert
+    return target.text, convert, target.remarks_at(latitude, longitude, source.text)
 
 
 def _utm(latitude: float, longitude: float) -> str:

@@ -161,6 +161,7 @@ class Survey:
         return {
             "crs": None if frame.is_local else frame.crs,
             "note": "local metres: the scene has no georeference" if frame.is_local else None,
+            "remarks": list(frame.remarks),
             "heights": "local" if frame.is_local else f"{kind}; no geoid is applied",
             "affine_map": {
                 "matrix": frame.matrix.tolist(),

@@ -110,6 +110,12 @@ def test_intervals_without_the_error_of_the_alignment_are_named(site, tmp_path, 
     assert "before → after: error of the alignment unknown, and left out: there is" in result.stderr
 
 
+def test_a_system_of_another_region_is_remarked_on(site, tmp_path):
+    result = survey(site[0], "--out", tmp_path / "out", "--resolution", "1", "--crs", "EPSG:32633")
+    (remark,) = json.loads((tmp_path / "out/survey.json").read_text())["coordinates"]["remarks"]
+    assert "outside of the area of EPSG:32633" in remark and f"note: {remark}" in result.stderr
+
+
 def test_two_runs_give_equal_files(site, tmp_path):
     run, _ = site
     for name in "ab":
@@ -124,6 +130,7 @@ def test_a_pair_that_is_named_twice_is_compared_once(site, tmp_path):
     twice = ("--between", "0", "1", "--between", "after", "before")
     assert survey(run, "--out", tmp_path / "out", "--resolution", "1", *twice).exit_code == 0
     summary = json.loads((tmp_path / "out/survey.json").read_text())
+    assert not summary["coordinates"]["remarks"]
     assert [pair["periods"] for pair in summary["pairs"]] == [[0, 1]]
     assert len((tmp_path / "out/volumes.csv").read_text().splitlines()) == 2
 

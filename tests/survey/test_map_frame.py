@@ -1,5 +1,6 @@
 """Map coordinates, compared with PROJ used directly."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -51,6 +52,20 @@ def test_a_projected_scene_with_an_offset(scene):
     convert = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:32633", always_xy=True)
     wanted = np.column_stack([*convert.transform(*(XYZ + offset).T[:2]), XYZ[:, 2] + 300])
     np.testing.assert_allclose(other.to_map(XYZ), wanted, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("world", "expected"),
+    [
+        (WorldFrame("metre", PLACE.crs), "46.5000 north, 11.3500 east, outside .* EPSG:25833"),
+        (WorldFrame("metre", "EPSG:32632", (680_000.0, 5_152_000.0, 0.0)), "outside .* EPSG:25833"),
+        (WorldFrame("metre", "EPSG:32633", (500_000.0, 5_152_000.0, 0.0)), None),
+    ],
+)
+def test_remarks_on_a_reference_system(scene, world, expected):
+    remarks = map_frame(replace(scene, world=world), "EPSG:25833").remarks
+    assert len(remarks) == (expected is not None)
+    assert expected is None or re.search(expected, remarks[0])
 
 
 def test_the_local_frame_with_an_offset(scene):

@@ -20,7 +20,7 @@ from chronoscene.cli.options import (
 from chronoscene.cli.output import check_place, emit, report_written, say, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.runs.changes import BETWEEN, parse_pairs
-from chronoscene.cli.scenes.reading import read_and_note
+from chronoscene.cli.scenes.reading import read_and_note, show_note
 from chronoscene.harness.files.records import RUN_FILE
 from chronoscene.harness.use.changes import usual_pairs
 from chronoscene.harness.use.trained_run import open_run
@@ -110,6 +110,8 @@ def _print(summary: Mapping[str, Any]) -> None:
         emit(f"period {period['label']}: {period['points']:,} points{_heights(period)}\n")
     coordinates = summary["coordinates"]
     emit(f"coordinates: {coordinates['note'] or coordinates['crs']}\n")
+    for remark in coordinates["remarks"]:
+        show_note(remark)
     if "note" in summary:
         say(f"note: {summary['note']}", fg="yellow")
 

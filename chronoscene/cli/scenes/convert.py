@@ -77,8 +77,7 @@ def command(
     if system is not None:
         frame = _local_frame(done.scene)
         write_coordinates(out, scene, frame, system)
-        if remark := system.remark_on(frame):
-            notes.append(remark)
+        notes += system.remarks_at(frame.latitude, frame.longitude)
     lines = [f"{out}: {target} from {done.scene.format}, {describe(scene)}"]
     lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")

@@ -234,6 +234,8 @@ def summary(registered: Registered, out: Path, crs: str | None) -> str:
             lines.append(
                 f"no coordinates in {crs}: neither GPS nor ground control places the model"
             )
-        elif remark := read_projected("--crs", crs).remark_on(registered.georeference):
-            lines.append(f"note: {remark}")
+        else:
+            frame = registered.georeference
+            remarks = read_projected("--crs", crs).remarks_at(frame.latitude, frame.longitude)
+            lines += [f"note: {remark}" for remark in remarks]
     return "\n".join(lines) + "\n"
