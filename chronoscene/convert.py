@@ -39,8 +39,8 @@ def convert(
     period_by: str | None = None,
     image_source: ImageSource = "copy",
     progress: Progress | None = None,
-    written: Collection[str] = (),
     check: Callable[[Scene], object] | None = None,
+    add: Callable[[Scene], Collection[str]] | None = None,
 ) -> Conversion:
     """Read a scene in any format and write it in another; the source is not changed.
 
@@ -52,8 +52,9 @@ def convert(
         period_by: How images are grouped into periods, where the source leaves a choice.
         image_source: Copy or link the images.
         progress: Called after each image.
-        written: Names of files that the caller writes into ``out`` afterwards.
         check: Called with the scene before anything is written; what it raises ends the conversion.
+        add: Called with the scene after it is written; returns names of files of the source that it
+            writes into ``out`` itself.
 
     Raises:
         SceneError: If the source is damaged, or ``out`` is in use.
@@ -65,9 +66,9 @@ def convert(
     scene = detected.read()
     if check is not None:
         check(scene)
-    notes = (*detected.notes, *remarks_on(scene, written))
-    warnings = (*notes, *losses(scene, target), *obstacles(scene))
     load_format(target).write(scene, out, image_source=image_source, progress=progress)
+    notes = (*detected.notes, *remarks_on(scene, () if add is None else add(scene)))
+    warnings = (*notes, *losses(scene, target), *obstacles(scene))
     return Conversion(scene, out, target, warnings)
 
 

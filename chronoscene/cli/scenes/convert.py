@@ -13,9 +13,11 @@ from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, describe_period, show_note
 from chronoscene.convert import convert
 from chronoscene.errors import ConfigError
+from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene, writable_formats
 from chronoscene.geodesy import Georeference, from_crs, read_projected
 from chronoscene.io.staging import check_outside
+from chronoscene.registration.output import copy_records
 from chronoscene.registration.report.coordinates import (
     coordinate_files,
     local_frame,
@@ -59,6 +61,11 @@ def command(
     """
     system = None if crs is None else read_projected("--crs", crs)
     check_outside(out, [source], option="OUT")
+
+    def add(scene: Scene) -> tuple[str, ...]:
+        copied = copy_records(scene, out) if target == our_format.NAME else ()
+        return copied if system is None else (*copied, *coordinate_files())
+
     with progress_bar(f"read {source}") as bar:
         done = convert(
             source,
@@ -68,8 +75,8 @@ def command(
             period_by=period_by,
             image_source=LINKS[link],
             progress=partial(bar, "images"),
-            written=() if system is None else coordinate_files(),
             check=None if system is None else _local_frame,
+            add=add,
         )
     # OUT may have other names of images and another split than SRC.
     scene = read_scene(out, format=target)

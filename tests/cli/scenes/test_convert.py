@@ -89,8 +89,19 @@ def test_coordinates_in_a_reference_system(make_scene_folder, tmp_path):
     (tmp_path / "out/certificate.json").touch()
     again = run(tmp_path / "out", tmp_path / "again", "--crs", "EPSG:32633")
     assert "not part of the format, and not converted: certificate.json\n" in again.stderr
-    without = run(tmp_path / "out", tmp_path / "without")
+    without = run(tmp_path / "out", tmp_path / "without", "--to", "nerfstudio")
     assert "not converted: cameras.csv, certificate.json, georeference.json" in without.stderr
+
+
+def test_records_of_a_registration_go_along(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    for name in ("georeference.json", "registration.json", "other.json"):
+        (folder / name).write_text("{}")
+    result = run(folder, tmp_path / "out")
+    assert "not converted: other.json\n" in result.stderr
+    assert {path.name for path in (tmp_path / "out").glob("*.json")} == {
+        "georeference.json", "registration.json",
+    }  # fmt: skip
 
 
 def test_coordinates_need_no_second_reading(make_scene_folder, tmp_path, monkeypatch):
