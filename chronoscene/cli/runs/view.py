@@ -73,7 +73,8 @@ def command(
     else:
         refuse_options(("scene", "plugin", "device"), "without a run")
         found = read_and_note(folders[0], dataset_format, period_by)
-        content = Content(found, summary=certificate_summary(folders[0]))
+        labels = [period.label for period in found.periods]
+        content = Content(found, summary=certificate_summary(folders[0], labels))
     server, status = ViewServer(content, host, chosen), 128 + signal.SIGTERM
     try:
         _report(host, server.port, port or PORT)
