@@ -14,7 +14,7 @@ from chronoscene.colmap.write import write_raw_model
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
 from chronoscene.images.exif import set_upright
-from chronoscene.images.masks import MASKS, mask_place
+from chronoscene.images.masks import MASKS, mask_name, mask_place
 from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
@@ -84,6 +84,7 @@ class _Fix:
         self._split(names)
         self._test(names)
         self._misspelt_images()
+        self._misspelt_masks()
         self._orientation_tags()
         self._copy_rest()
         return self._repairs
@@ -197,6 +198,24 @@ class _Fix:
         if names := list(self._renamed):
             what = f"{counted(len(names), 'image')} renamed as in the model: {shown(names)}"
             self._repairs.append(Repair("CS201", what))
+
+    def _misspelt_masks(self) -> None:
+        """Rename masks whose name differs from that of an image only by its `spelling`."""
+        top, images = self._scene.root.resolve(), {*self._scene.present, *self._renamed}
+        by_spelling = grouped((spelling(file), file) for file in self._scene.mask_files)
+        renamed = []
+        for name in sorted(images):
+            files = by_spelling.get(spelling(mask_name(name)), [])
+            if len(files) != 1 or files[0].removesuffix(".png") in images:
+                continue
+            source, target = self._scene.root / MASKS / files[0], self._out / mask_place(name)
+            if not os.path.lexists(target) and _leads_into(source, top):
+                self._written.add(f"{MASKS}/{files[0]}")
+                _link(source, target)
+                renamed.append(mask_name(name))
+        if renamed:
+            what = f"{counted(len(renamed), 'mask')} renamed after the image: {shown(renamed)}"
+            self._repairs.append(Repair("CS243", what))
 
     def _orientation_tags(self) -> None:
         """Reset tags that rotate images in viewers: the poses refer to the pixels as stored."""

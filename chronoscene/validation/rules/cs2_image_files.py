@@ -273,7 +273,8 @@ def mask_size(readable: dict[str, Header], mask_headers: dict[str, Header]) -> I
 @rule.warning(
     "CS243",
     bad="`masks/x.png` for `images/x.jpg`, whose mask is `masks/x.jpg.png`",
-    remedy="name the mask after its image, with the extension of the image and then .png",
+    remedy="name the mask after its image, with the extension of the image and then .png; "
+    "chronoscene validate --fix does so where only capitals or the form of accents differ",
 )
 def mask_without_image(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     """A file in `masks/` is not the mask of an image, so it is not used."""

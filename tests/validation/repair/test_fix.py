@@ -5,6 +5,7 @@ import io
 import json
 import os
 import signal
+import unicodedata
 
 import numpy as np
 import pytest
@@ -290,6 +291,23 @@ def test_misspelt_image(scene, fix, tmp_path):
     assert sorted(p.name for p in (out / "masks").iterdir()) == [
         f"a{i:03d}.png.png" for i in range(9)
     ]
+
+
+def test_masks_of_another_spelling(scene, fix):
+    """Of macOS, for example: accents are characters of their own."""
+    name = unicodedata.normalize("NFC", "pläne.png")
+    scene.path("images/a000.png").rename(scene.path(f"images/{name}"))
+    for place in ("sparse/0/images.txt", "sparse/split.txt"):
+        scene.replace(place, "a000.png", name)
+    scene.path("masks").mkdir()
+    names = (unicodedata.normalize("NFD", name), "A001.PNG", *(f"a00{i}.png" for i in range(2, 9)))
+    for i, mask in enumerate(names):
+        Image.new("L", (64, 48), 255 - i).save(scene.path(f"masks/{mask}.png"))
+    fixed, after, out = fix()
+    assert fixed == {"CS243"} and after == {"CS507"}
+    assert {p.name for p in (out / "masks").iterdir()} == {
+        f"{name}.png", *(f"a00{i}.png.png" for i in range(1, 9)),
+    }  # fmt: skip
 
 
 def tagged(image, orientation, *, order="<"):
