@@ -215,8 +215,10 @@ def is_transparent(image: Image.Image) -> bool:
 
 def _opaque(image: Image.Image) -> NDArray[np.bool_] | None:
     """Return True where alpha is one half or more; None if there is none. [H, W]"""
-    if image.mode.startswith("I") or not is_transparent(image):
+    if not is_transparent(image):
         return None
+    if image.mode.startswith("I"):  # one transparent value of 16 bits, which Pillow ignores
+        return np.asarray(image) != image.info["transparency"]
     return np.asarray(image.convert("RGBA"))[..., 3] >= 128
 
 

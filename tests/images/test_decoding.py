@@ -2,6 +2,7 @@
 
 import io
 import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -49,6 +50,17 @@ def test_transparent_palette_and_grey_with_alpha(tmp_path):
     grey = Image.merge("LA", [Image.new("L", (1, 1), 200), Image.new("L", (1, 1), 0)])
     image, mask = load_photo(save(tmp_path, grey, "la.png"))
     assert image.tolist() == [[[200, 200, 200]]] and mask.tolist() == [[False]]
+
+
+def test_one_transparent_value_of_16_bits(tmp_path):
+    values = np.array([[5000, 5001, 65535]], np.uint16)
+    Image.fromarray(values).save(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    content = b"tRNS" + struct.pack(">H", 5000)
+    chunk = struct.pack(">I", 2) + content + struct.pack(">I", zlib.crc32(content))
+    at = data.index(b"IDAT") - 4
+    (tmp_path / "a.png").write_bytes(data[:at] + chunk + data[at:])
+    np.testing.assert_array_equal(load_photo(tmp_path / "a.png")[1], [[False, True, True]])
 
 
 def test_a_mask_file_and_alpha_both_have_to_allow_a_pixel(tmp_path):
