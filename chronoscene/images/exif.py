@@ -38,6 +38,9 @@ _DATE = re.compile(
     re.ASCII,
 )
 
+YEARS = range(1990, 2100)
+"""Years of photos; clocks that were never set say less, and damaged ones more."""
+
 RTK_FIXED, RTK_FLOAT = 50, 34
 """Values of ``RtkFlag``; 16 is a position without corrections, 0 is none."""
 
@@ -79,6 +82,8 @@ class ExifData:
     """Metres, negative below the reference: the sea or the ellipsoid, which the maker decides."""
     no_hemisphere: bool = False
     """True if a position is left out as it names no hemisphere: Exif has no default for it."""
+    is_void: bool = False
+    """True if a position is left out as the receiver had none: it may be an old one."""
     focal_mm: float | None = None
     focal_35mm: float | None = None
     """Focal length on 36 x 24 mm film with the same view, in millimetres."""
@@ -172,8 +177,11 @@ def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
     north = _sign(gps.get(GPS.GPSLatitudeRef), "NS")
     east = _sign(gps.get(GPS.GPSLongitudeRef), "EW")
     no_hemisphere = False
+    is_void = False
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         latitude = longitude = None  # without a fix, some cameras write zeros
+    elif (_text(gps.get(GPS.GPSStatus)) or "").upper().startswith("V"):
+        latitude, longitude, is_void = None, None, True
     elif north is None or east is None:
         latitude, longitude, no_hemisphere = None, None, True
     else:
@@ -189,6 +197,7 @@ def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
         longitude=longitude,
         altitude=altitude,
         no_hemisphere=no_hemisphere,
+        is_void=is_void,
         focal_mm=_positive(_number(exif.get(Base.FocalLength))),
         focal_35mm=_positive(_number(exif.get(Base.FocalLengthIn35mmFilm))),
         focal_plane=_focal_plane(exif),
@@ -260,7 +269,7 @@ def _date(value: Any) -> datetime | None:
             date = datetime(year, month, day, *clock)
         except ValueError:
             continue
-        return date if year >= 1990 else None  # clocks that were never set say less
+        return date if year in YEARS else None
     return None
 
 

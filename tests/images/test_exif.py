@@ -114,10 +114,17 @@ def test_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "date", ["0000:00:00 00:00:00", "2016:13:01 00:00:00", "1980:01:01 00:00:00", "yesterday", ""]
-)
+    "date",
+    [
+        "0000:00:00 00:00:00", "2016:13:01 00:00:00", "1980:01:01 00:00:00", "2107:12:31 23:59:58",
+        "9999:12:31 23:59:59", "yesterday", "",
+    ],
+)  # fmt: skip
 def test_dates_that_are_none(date):
     assert read(photo(exif={0x9003: date})).date is None
+    gps = {1: "N", 2: (48, 0, 0), 3: "E", 4: (11, 0, 0), 7: (23, 59, 59), 29: date[:10]}
+    data = read(photo(gps=gps))
+    assert data.date is None and data.latitude == 48
 
 
 def test_date_of_digitisation_where_there_is_no_other():
@@ -145,6 +152,12 @@ def test_positions_that_are_none(gps):
 def test_positions_without_a_hemisphere_are_none(references):
     data = read(photo(gps={2: (33, 51, 24.12), 4: (70, 30, 0.0)} | references))
     assert not data.has_position and data.no_hemisphere
+
+
+@pytest.mark.parametrize(("status", "is_void"), [("V", True), ("A", False), ("", False)])
+def test_a_position_without_a_fix_is_none(status, is_void):
+    data = read(photo(gps={1: "N", 2: (48, 0, 0), 3: "E", 4: (11, 0, 0), 9: status}))
+    assert data.is_void == is_void and data.has_position != is_void
 
 
 @pytest.mark.parametrize(("north", "east"), [("n", "west"), ("North", "W\0")])

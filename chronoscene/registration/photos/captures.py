@@ -400,13 +400,22 @@ def _assemble(
 
 def _unplaced(images: Sequence[Capture]) -> tuple[str, ...]:
     """Name photos whose GPS position is not used; nothing if there are none."""
-    found = [c.name for c in images if c.exif.no_hemisphere]
-    if not found:
-        return ()
-    return (
-        f"{len(found)} of {len(images)} photos, such as {found[0]}, have a GPS position without "
-        "N or S, or without E or W; it is not used; write what is missing with exiftool "
-        "(GPSLatitudeRef, GPSLongitudeRef)",
+    reasons = (
+        (
+            [c.name for c in images if c.exif.no_hemisphere],
+            "without N or S, or without E or W; it is not used; write what is missing with "
+            "exiftool (GPSLatitudeRef, GPSLongitudeRef)",
+        ),
+        (
+            [c.name for c in images if c.exif.is_void],
+            "that the receiver marked as void (GPSStatus V); it is not used; if it is right, "
+            "delete the mark (exiftool -GPSStatus=)",
+        ),
+    )
+    return tuple(
+        f"{len(found)} of {len(images)} photos, such as {found[0]}, have a GPS position {reason}"
+        for found, reason in reasons
+        if found
     )
 
 

@@ -165,17 +165,23 @@ def test_undated_photos_of_one_visit_are_of_that_period(tmp_path: Path) -> None:
     assert len(found.periods) == 1 and len(found.images) == 2 and not found.notes
 
 
-def test_positions_without_a_hemisphere_are_not_used_and_said(tmp_path: Path) -> None:
-    for name, reference in (("2016/a.jpg", {}), ("2023/b.jpg", {1: "S", 3: "E"})):
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [({}, "without N or S"), ({1: "S", 3: "E", 9: "V"}, "that the receiver marked as void")],
+)
+def test_positions_that_are_not_used_are_said(
+    tmp_path: Path, wrong: dict[int, str], said: str
+) -> None:
+    for name, more in (("2016/a.jpg", wrong), ("2023/b.jpg", {1: "S", 3: "E"})):
         exif = Image.Exif()
         exif[0x010F] = "Maker"
-        exif.get_ifd(0x8825).update({2: (33, 51, 24.0), 4: (151, 12, 36.0)} | reference)
+        exif.get_ifd(0x8825).update({2: (33, 51, 24.0), 4: (151, 12, 36.0)} | more)
         with Image.open(photo(tmp_path / name)) as image:
             image.save(tmp_path / name, exif=exif)
     found = read_captures(tmp_path)
     assert [c.gps is None for c in found.images] == [True, False]
     (note,) = found.notes
-    assert note.startswith("1 of 2 photos, such as 2016/a.jpg, have a GPS position without N or S")
+    assert note.startswith(f"1 of 2 photos, such as 2016/a.jpg, have a GPS position {said}")
     assert note in found.remarks
 
 
