@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.arrays import Mask
+from chronoscene.arrays import Array, Mask
 from chronoscene.errors import ConfigError
 from chronoscene.io.documents import read_json_document
 from chronoscene.survey.grid import Grid
@@ -138,6 +138,12 @@ def _on_map(place: str, system: Any, feature: Any, frame: MapFrame) -> Any:
     shape = feature.get("geometry", feature) if isinstance(feature, dict) else {}
     if not _is_polygon(shape) or not is_valid_geom(shape):
         raise _wrong(place, "a polygon of GeoJSON", "none", "draw areas as polygons")
+    for rings in (
+        shape["coordinates"] if shape["type"] == "MultiPolygon" else [shape["coordinates"]]
+    ):
+        if (crossing := _find_crossing(rings)) is not None:
+            found = "one that crosses itself near {:.10g}, {:.10g}".format(*crossing)
+            raise _wrong(place, "a polygon with an inside", found, "move its corners apart there")
     left, bottom, right, top = bounds(shape)
     angles = max(-left, right) <= 180 and max(-bottom, top) <= 90
     crs = "OGC:CRS84" if angles and not frame.is_local else None
@@ -172,6 +178,29 @@ def _is_polygon(shape: Any) -> bool:
         and all(isinstance(x, int | float) and abs(x) < np.inf for x in corner)
         for corner in inner
     )
+
+
+def _find_crossing(rings: Any) -> Array | None:
+    """Start of an edge that crosses another one; None if edges touch at most. [2]"""
+    corners = [np.array([corner[:2] for corner in ring], np.float64) for ring in rings]
+    starts = np.concatenate(corners)
+    ends = np.concatenate([np.roll(ring, -1, axis=0) for ring in corners])
+    order = np.argsort(np.minimum(starts, ends)[:, 0])
+    starts, ends = starts[order], ends[order]
+    left, right = np.minimum(starts, ends)[:, 0], np.maximum(starts, ends)[:, 0]
+    stops = np.searchsorted(left, right, side="right")  # later edges begin farther to the right
+    for i, (start, end, stop) in enumerate(zip(starts, ends, stops, strict=True)):
+        a, b = starts[i + 1 : stop], ends[i + 1 : stop]
+        sides = _side(start, end, a) * _side(start, end, b) < 0
+        if (sides & (_side(a, b, start) * _side(a, b, end) < 0)).any():
+            return start
+    return None
+
+
+def _side(start: Array, end: Array, point: Array) -> Array:
+    """Sign of the side of a line that a point is on; 0 for its ends. [..., 2] -> [...]"""
+    along, away = end - start, point - start
+    return np.sign(along[..., 0] * away[..., 1] - along[..., 1] * away[..., 0])
 
 
 def _outside(place: str) -> ConfigError:

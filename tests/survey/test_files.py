@@ -181,6 +181,20 @@ def test_properties_of_another_kind(tmp_path):
     assert list(read(tmp_path, data)) == ["1"]
 
 
+def test_a_polygon_whose_edges_touch(tmp_path):
+    """A ring that runs to a hole and back, as some programs write holes."""
+    hole = [[4, 3], [4, 4], [5, 4], [5, 3], [4, 3]] + SQUARE[0] - [2, 2]
+    made = read(tmp_path, geojson([SQUARE[0], *hole, *SQUARE]))["1"]
+    assert made.cells.sum() * 0.25 == 15 - 1
+
+
+def test_a_hole_that_crosses_the_border(tmp_path):
+    data = geojson(SQUARE)
+    data["features"][0]["geometry"]["coordinates"].append((SQUARE + 1).tolist())
+    with pytest.raises(ConfigError, match="a polygon with an inside, found one that crosses"):
+        read(tmp_path, data)
+
+
 @pytest.mark.parametrize(
     ("data", "frame", "message"),
     [
@@ -202,6 +216,7 @@ def test_properties_of_another_kind(tmp_path):
         (geojson([[180, 90], [-180, 90], [0, -90], [180, 90]]), UTM, "on the map|expected"),
         (geojson(SQUARE + 1e4), UTM, "on the map, found one outside"),
         (geojson(SQUARE[0] + SLIVER), UTM, "one without the centre of a cell; choose"),
+        (geojson(SQUARE[[0, 2, 1, 3]]), UTM, "one that crosses itself near 680..., 515199."),
         (geojson(SQUARE, "EPSG:nonsense"), UTM, "a known crs"),
         (geojson(SQUARE, "EPSG:32632"), HERE, "scene has none, .*draw them in the metres"),
         (geojson(SQUARE) | {"crs": 3}, UTM, "a known crs"),
