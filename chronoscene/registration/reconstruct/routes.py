@@ -113,6 +113,9 @@ def _merged(
         adjust(model, task)
     else:
         task.report("aligning", 0, 1)
+        for submodel in submodels:  # whose labels the remarks below have
+            names = sorted(submodel.names)
+            task.remarks.append(f"{submodel.label}: {len(names)} images, {names[0]} to {names[-1]}")
         keep = arguments["keep_unplaced"]
         combined = combine(submodels, matches, priors, task.database, keep_unplaced=keep)
         task.remarks.extend(combined.remarks)
