@@ -26,6 +26,7 @@ KEY = (
 )
 """Fields of `RunRecord` in which the seeds of a configuration agree on one device."""
 _DIFFERENCES = {
+    "name": ("scene", "names of the scene"),
     "width": ("max_width", "--max-width"),
     "protocol": ("protocol", "--protocol"),
     "fitted": ("fitted", "--fit-half"),
@@ -85,11 +86,14 @@ def comparable(runs: Iterable[RunRecord]) -> dict[Setting, list[RunRecord]]:
 def apart(records: Sequence[RunRecord]) -> list[RunRecord]:
     """Give each test of a scene a name of its own where there are several, and a notice.
 
-    Tables, figures and means go by the name of the scene.
+    Tables, figures and means go by the name of the scene. A scene with several names has the first.
     """
     tests: dict[str, dict[tuple[str | int, ...], RunRecord]] = {}
+    names_of: dict[str, str] = {}
     for run in records:
-        tests.setdefault(run.scene, {}).setdefault(setting_of(run).test, run)
+        name = names_of.setdefault(run.scene_hash, scene_of(run.scene))
+        scene = run.scene if scene_of(run.scene) == name else name
+        tests.setdefault(scene, {}).setdefault(setting_of(run).test, run)
     changes: dict[tuple[str | int, ...], dict[str, str]] = {}
     for scene, of_scene in tests.items():
         if len(of_scene) == 1:
@@ -108,7 +112,7 @@ def apart(records: Sequence[RunRecord]) -> list[RunRecord]:
             differing.append("scene")  # its hash covers the split, too
         values = {kind: ", ".join(dict.fromkeys(n[kind] for n in names)) for kind in differing}
         what = "; ".join(f"{_DIFFERENCES[kind][1]} ({text})" for kind, text in values.items())
-        notice = f"{scene}: runs with different {what} cannot be compared, and stand apart"
+        notice = f"{scene}: runs with different {what} are not compared, and stand apart"
         for test, n in zip(of_scene, names, strict=True):
             name = f"{scene} [{', '.join(f'{kind} {n[kind]}' for kind in differing)}]"
             changes[test] = {"scene": name, "notice": notice}

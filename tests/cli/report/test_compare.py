@@ -51,7 +51,7 @@ def test_runs_of_another_width_have_no_pictures(tmp_path):
     assert "plaza [width 4]: no pictures" in result.stderr
     figures = [f"plaza [width 1600]_{name}.png" for name in ("comparison", "errors")]
     assert sorted(p.name for p in (runs / "figures").iterdir()) == [*map(safe_name, figures)]
-    assert "cannot be compared, and stand apart" in (tmp_path / "page.html").read_text()
+    assert "are not compared, and stand apart" in (tmp_path / "page.html").read_text()
 
 
 def test_csv_has_every_view_and_more_views_make_more_rows(runs, tmp_path):

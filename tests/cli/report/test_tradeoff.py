@@ -99,7 +99,7 @@ def test_widths_are_not_compared(runs, undrawn):
     text = tradeoff(runs).stdout
     assert "QUICK (joint, fast, max_width=800)" in text
     assert "plaza [width 800]: Pareto fronts" in text
-    assert "runs with different --max-width (1600, 800) cannot be compared" in text
+    assert "runs with different --max-width (1600, 800) are not compared" in text
     assert "mean of scenes" not in text
     chosen = tradeoff(runs, "--budget", "1m").stdout.splitlines()
     assert [line.partition(",")[0] for line in chosen] == [

@@ -52,11 +52,26 @@ def test_a_budget_for_each_model_is_that_of_all_models():
 
 
 def test_tests_of_one_scene_have_names_of_their_own():
-    runs = [record(), record("3dgs", max_width=800), record("3dgs", scene="quay", max_width=800)]
+    quay = record("3dgs", scene="quay", scene_hash="q", max_width=800)
+    runs = [record(), record("3dgs", max_width=800), quay]
     assert [run.scene for run in apart(runs)] == ["plaza [width 1600]", "plaza [width 800]", "quay"]
     assert apart(runs[1:]) == runs[1:] and apart(apart(runs)) == apart(runs)
     both = [record(), record(split_hash="0" * 8, max_width=800)]
     assert apart(both)[1].scene == "plaza [width 800, split 000000]"
+
+
+def test_a_scene_with_two_names_is_one_scene():
+    runs = [record(), record(scene="copy"), record(scene="quay", scene_hash="q")]
+    found = apart(runs)
+    names = ["plaza [name plaza]", "plaza [name copy]", "quay"]
+    assert [run.scene for run in found] == names and apart(found) == found
+    assert not several_scenes(names)
+    assert found[1].notices == [
+        "plaza: runs with different names of the scene (plaza, copy) are not compared, and stand "
+        "apart"
+    ]
+    narrow = [*found, *apart([record(max_width=800), record(max_width=40)])]
+    assert apart(narrow) == narrow
 
 
 def test_a_mean_over_scenes_needs_one_test_of_each():
