@@ -35,6 +35,7 @@ _RANKS = {
 # Numbers stay aligned on the right.
 _TIES = {"table": "†{}", "markdown": "{} †", "latex": r"{}\rlap{{$^\dagger$}}"}
 
+_NEGATIVE = re.compile(r"(?<![\w.-])-(?=\d)")  # No hyphen, as in dates and ranges
 GAP = 2  # Blanks between columns
 MIN_NAME_WIDTH = 12  # Characters of a name that are shown even on narrow terminals
 
@@ -226,7 +227,8 @@ def latex(table: Table, *, cmidrules: bool = False) -> str:
         r"\midrule",
     ]
     for i, row in enumerate(table.rows):
-        cells = [escape_latex(cell) for cell in row]
+        numbers = [_NEGATIVE.sub("\N{MINUS SIGN}", cell) for cell in row[table.labels :]]
+        cells = [escape_latex(cell) for cell in (*row[: table.labels], *numbers)]
         lines.append(_latex_row(_marked(table, i, j, c, "latex") for j, c in enumerate(cells)))
         if i in table.breaks:
             lines.append(r"\midrule")

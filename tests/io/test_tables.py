@@ -85,6 +85,12 @@ def test_latex(cmidrules):
     ]
 
 
+def test_negative_numbers_of_latex_have_a_minus():
+    table = Table(["n-1", "a", "b", "c"], [["-2 x", "-0.52 ± 0.10", "2016-05-03", "-"]])
+    row = latex(table).splitlines()[4]
+    assert row == r"-2 x & $-$0.52 $\pm$ 0.10 & 2016-05-03 & - \\"
+
+
 def test_ranks_and_ties_are_marked():
     rows = [[name, value] for name, value in zip("abcd", ("9", "8", "7", "6"), strict=True)]
     ranks = {(0, 1): 1, (1, 1): 2, (2, 1): 3}

@@ -74,13 +74,13 @@ def _draw_matrix(
 ) -> Any:
     """Draw one heat map, in colours for the trained models of all those ``found``."""
     known = np.concatenate([matrix[1:][np.isfinite(matrix[1:])] for matrix in found])
-    low, high = known.min(), known.max()
+    low, high = (known.min(), known.max()) if len(known) else (0.0, 0.0)  # all are infinite
     colors = "viridis" if metric.higher_is_better else "viridis_r"
     image = axis.imshow(values, vmin=low, vmax=high, cmap=colors)
     axis.set_facecolor("0.9")
     periods = len(names)
     for (row, column), value in np.ndenumerate(values):
-        if periods <= WRITTEN and np.isfinite(value):
+        if periods <= WRITTEN and not np.isnan(value):
             is_bright = (value - low > 0.6 * (high - low)) == metric.higher_is_better
             ink = "black" if is_bright else "white"
             text = f"{value:.{metric.decimals}f}"

@@ -32,3 +32,14 @@ def test_names_are_no_formulas(bench_here, tmp_path):
     names = {"scene": "$_$", "title": "$_$", "period_labels": {"0": "$_$", "1": "1"}}
     (path,) = draw_stages(tmp_path / "runs", [run.model_copy(update=names)])
     assert path.stat().st_size > 1_000
+
+
+def test_infinite_scores_of_all_stages_are_drawn(bench_here, tmp_path):
+    bench_here("toy_methods:MEAN", strategies=("sequential",))
+    (run,) = read_runs([tmp_path / "runs"])[0]
+    stages = {
+        name: {i: dict.fromkeys(values, float("inf")) for i, values in periods.items()}
+        for name, periods in run.stages.items()
+    }
+    (path,) = draw_stages(tmp_path / "runs", [run.model_copy(update={"stages": stages})])
+    assert path.stat().st_size > 1_000
