@@ -2,7 +2,7 @@
 
 All values are float32: the centre, the rotation xyzw, the scales, the opacity, and spherical
 harmonics of degree 0 to 3 by degree and order. They are in the frame of the scene; the node turns
-it so that up is +y, as glTF has it.
+it so that up is +y, as glTF has it. The container counts its bytes in 32 bits.
 
 Source: KHR_gaussian_splatting of github.com/KhronosGroup/glTF, ratified; a draft before had the
 logarithms of the scales.
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chronoscene.errors import ConfigError
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 
 NAME = "KHR_gaussian_splatting"
@@ -25,6 +26,8 @@ NAME = "KHR_gaussian_splatting"
 _HARMONICS = [f"{NAME}:SH_DEGREE_{d}_COEF_{n}" for d in range(4) for n in range(2 * d + 1)]
 _MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
+MAX_BYTES = 2**32 - 1
+_BYTES, _REST = 240, 1 << 20  # Of a Gaussian; room for the JSON
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -34,7 +37,17 @@ def encode(cloud: GaussianCloud, *, up: ArrayLike) -> bytes:
     Args:
         cloud: In the frame of the scene.
         up: Direction that is up in the scene. [3]
+
+    Raises:
+        ConfigError: If the file would be larger than the format allows.
     """
+    if len(cloud) > (most := (MAX_BYTES - _REST) // _BYTES):
+        raise ConfigError(
+            "export as glTF",
+            expected=f"at most {most:,} Gaussians, as the file ends at 4 GiB",
+            found=f"{len(cloud):,}",
+            todo="choose another format, such as --to spz or ply",
+        )
     quats = cloud.quats[:, [1, 2, 3, 0]] / np.linalg.norm(cloud.quats, axis=1, keepdims=True)
     columns: dict[str, NDArray[np.float32]] = {
         "POSITION": cloud.means,

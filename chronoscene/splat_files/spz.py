@@ -5,7 +5,7 @@ down, front, so y and z change their sign here and in every program that follows
 
 | value | stored as |
 | --- | --- |
-| centre | 24 bits fixed point per axis |
+| centre | 24 bits fixed point per axis; what is `FAR` beyond all others is moved to their limits |
 | logarithm of a scale | 8 bits, steps of 1/16 from -10 to 5.94 |
 | rotation | the three smaller components of the quaternion xyzw, 10 bits each; 2 bits for which |
 | opacity | 8 bits |
@@ -29,6 +29,9 @@ from chronoscene.splat_files.rotations import with_largest, without_largest
 
 MAGIC, VERSION, SH_DEGREE, ANTIALIASED = 0x5053474E, 3, 3, 1
 
+USUAL, FAR = 0.999, 64.0
+"""Centres become limits beyond so many times the largest coordinate of this share of Gaussians, and
+beyond 2,048 units: the coordinates of all others would be coarse for their sake."""
 COLOUR_SCALE = 0.15 * 255
 """Steps per unit of a constant coefficient."""
 
@@ -73,6 +76,11 @@ def encode_plain(cloud: GaussianCloud, *, antialiased: bool) -> bytes:
     return header + b"".join(part.tobytes() for part in parts)
 
 
+def count_far(cloud: GaussianCloud) -> int:
+    """Count the Gaussians that `encode` moves to its limits, as they are far from all others."""
+    return int((_distances(cloud.means) > _limit(cloud.means)).sum())
+
+
 def decode(data: bytes) -> GaussianCloud:
     """Read what `encode` made."""
     raw = gzip.decompress(data)
@@ -99,9 +107,21 @@ def decode(data: bytes) -> GaussianCloud:
 
 def _fractional_bits(means: NDArray[np.float32]) -> int:
     """Return 12, or what a scene beyond 2,048 units leaves; more where all is within 128 units."""
-    largest = float(np.abs(means).max(initial=0.0))
+    largest = min(float(_distances(means).max(initial=0.0)), _limit(means))
     integer_bits = max(0, int(np.ceil(np.log2(largest + 1e-6))))
-    return max(0, min(max(12, 19 - integer_bits), 22 - integer_bits))
+    return max(0, min(max(12, 19 - integer_bits), 23 - integer_bits))
+
+
+def _limit(means: NDArray[np.float32]) -> float:
+    """Return the largest coordinate that is kept."""
+    usual = np.quantile(_distances(means), USUAL, method="lower") if len(means) else 0.0
+    return max(2_048.0, FAR * float(usual))
+
+
+def _distances(means: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the largest coordinate of each Gaussian. [N]"""
+    distances: NDArray[np.float32] = np.abs(means).max(axis=1)
+    return distances
 
 
 def _to_byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:

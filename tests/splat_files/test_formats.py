@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from benchmarks.exports import readers
+from chronoscene.errors import ConfigError
 from chronoscene.scene.gaussian_cloud import GaussianCloud
-from chronoscene.splat_files import SUFFIXES, decode, encode, sog, spz, with_comments
+from chronoscene.splat_files import SUFFIXES, decode, encode, gltf, sog, spz, with_comments
 
 UP = (0.0, 0.0, 1.0)
 
@@ -148,6 +149,29 @@ def test_the_resolution_of_spz_follows_the_size_of_the_scene(spread, step):
     cloud = make_cloud(spread=spread)
     read = spz.decode(spz.encode(cloud, antialiased=False))
     assert np.abs(read.means - cloud.means).max() <= step
+
+
+def test_a_gaussian_far_away_does_not_coarsen_the_others_in_spz(tmp_path):
+    """The description of the format: 24 bits with a sign, in steps of 2^-bits."""
+    cloud = make_cloud(2_000)
+    cloud.means[7] = 3e6, -5, 7
+    assert spz.count_far(cloud) == 1
+    read = readers.read(write(tmp_path, "spz", cloud))
+    error = np.abs(read.means - cloud.means)
+    assert error[7, 1:].max() <= 2**-10 and read.means[7, 0] >= 64 * 100
+    assert np.delete(error, 7, axis=0).max() <= 2**-10
+    sky = replace(cloud, means=np.where(cloud.means > 1e6, 2_000, cloud.means).astype(np.float32))
+    assert spz.count_far(sky) == 0
+    assert np.abs(readers.read(write(tmp_path, "spz", sky)).means - sky.means).max() <= 2**-13
+
+
+def test_gltf_that_its_header_cannot_count_is_refused(monkeypatch):
+    cloud = make_cloud(10)
+    monkeypatch.setattr(gltf, "MAX_BYTES", gltf._REST + 2_400)
+    assert len(gltf.encode(cloud, up=UP)) < gltf.MAX_BYTES
+    monkeypatch.setattr(gltf, "MAX_BYTES", gltf._REST + 2_399)
+    with pytest.raises(ConfigError, match="at most 9 Gaussians, as the file ends at 4 GiB, found"):
+        gltf.encode(cloud, up=UP)
 
 
 def test_a_node_of_gltf_turns_up_to_y(tmp_path):

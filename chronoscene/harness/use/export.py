@@ -23,6 +23,7 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.orbit import find_up
 from chronoscene.scene.scene import spread_frames
 from chronoscene.scene.similarity import Sim3
+from chronoscene.splat_files import spz
 
 LIMIT_DB = 0.3
 """PSNR that plain viewers may lose on training views, for them to be the default."""
@@ -126,7 +127,7 @@ def make_file(
     read = splat_files.decode(kind, data)
     in_training = read.transformed(run.training_from_local(prepared.offset))
     loss = measure_loss(run, scene, period, in_training, _frames(scene, "test", period))
-    comments = _comments(run, scene, period, prepared, loss)
+    comments = _comments(run, scene, period, prepared, loss, kind)
     return Export(splat_files.with_comments(kind, data, comments), loss, comments)
 
 
@@ -231,7 +232,12 @@ def _adapted(
 
 
 def _comments(
-    run: TrainedRun, scene: Scene, period: float, prepared: Prepared, loss: ExportLoss | None
+    run: TrainedRun,
+    scene: Scene,
+    period: float,
+    prepared: Prepared,
+    loss: ExportLoss | None,
+    format: str,
 ) -> tuple[str, ...]:
     """Return what a file says of itself, in lines of ASCII as PLY has them."""
     label = run.record.period_labels.get(f"{period:g}", "")
@@ -246,6 +252,8 @@ def _comments(
         lines.append("The exposure is in the colours; a viewer lacks it where background shows")
     if prepared.offset.any():
         lines.append(_describe_offset(scene, prepared.offset))
+    if format == "spz" and (far := spz.count_far(prepared.cloud)):
+        lines.append(f"Moved nearer, as SPZ has not the range: {counted(far, 'Gaussian')} far away")
     return tuple(printable(line).encode("ascii", "replace").decode() for line in lines)
 
 
