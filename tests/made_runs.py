@@ -55,6 +55,17 @@ def record(method="chronogs", seed=0, *, psnr=(20.0, 30.0), ssim=None, **changes
     return RunRecord(**{**fields, **changes})
 
 
+def rows_of(run):
+    """Rows that a run of one test view per period has."""
+    whole = {"periods": run.periods}
+    return [
+        ViewScore(f"{i}.png", int(i), int(i), region, metric, value)
+        for region, part in {"all": whole, **run.regions}.items()
+        for i, values in part["periods"].items()
+        for metric, value in values.items()
+    ]
+
+
 def scored(method="chronogs", seed=0, *, psnr, **changes):
     """A run with the PSNR of each view, by period. [P][N]"""
     rows = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -270,17 +270,29 @@ def read_scored(folder: Path) -> RunRecord:
         parts = run.regions.get(region, {"aggregates": run.aggregates, "periods": run.periods})
         stored = {name: values for part in parts.values() for name, values in part.items()}
         aggregates, periods = aggregate(run.rows, region)
-        for name, means in (aggregates | periods).items():
-            for metric, mean in means.items():
-                found = stored.get(name, {}).get(metric, math.nan)
-                if not math.isclose(found, mean, rel_tol=1e-6, abs_tol=1e-6):
-                    raise CheckpointError(
-                        folder / RUN_FILE,
-                        expected=f"{mean:.6g} as {metric}, {name}: the mean of {ROWS_FILE}",
-                        found=f"{found:.6g}",
-                        todo="compute both again with chronoscene score RUNS",
-                    )
+        for place, found, mean in _pairs(stored, aggregates | periods):
+            if not math.isclose(found, mean, rel_tol=1e-6, abs_tol=1e-6):
+                raise CheckpointError(
+                    folder / RUN_FILE,
+                    expected=f"{_text(mean)} as {place}: the mean of {ROWS_FILE}",
+                    found=_text(found),
+                    todo="compute both again with chronoscene score RUNS",
+                )
     return run
+
+
+def _pairs(
+    stored: Mapping[str, Values], computed: Mapping[str, Values]
+) -> Iterator[tuple[str, float, float]]:
+    """Yield the place of each mean that either has, and both values; NaN where there is none."""
+    for name in dict.fromkeys((*computed, *stored)):
+        one, other = stored.get(name, {}), computed.get(name, {})
+        for metric in dict.fromkeys((*other, *one)):
+            yield f"{metric}, {name}", one.get(metric, math.nan), other.get(metric, math.nan)
+
+
+def _text(mean: float) -> str:
+    return "nothing" if math.isnan(mean) else f"{mean:.6g}"
 
 
 def changes(before: Mapping[str, Values], after: Mapping[str, Values]) -> list[str]:

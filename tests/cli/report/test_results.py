@@ -9,7 +9,7 @@ from shutil import copytree
 
 import pytest
 from command_line import invoke, succeed
-from made_runs import record, write_scored
+from made_runs import record, rows_of, write_scored
 
 import chronoscene.cli.report.results as results_module
 from chronoscene.cli.options import split_list
@@ -33,7 +33,7 @@ def runs(tmp_path):
         )
         folder = tmp_path / "runs" / "plaza" / "m-joint-fast" / f"seed{seed}"
         folder.mkdir(parents=True)
-        write_run(folder, run, [])
+        write_run(folder, run, rows_of(run))
     return tmp_path / "runs"
 
 
@@ -143,6 +143,13 @@ def test_a_mean_that_is_not_that_of_the_views_is_refused(tmp_path, claimed, mess
         table(tmp_path / "runs")
 
 
+def test_a_mean_without_values_of_views_is_refused(tmp_path):
+    rows = write_scored(tmp_path / "runs") / "rows.csv"
+    rows.write_text(rows.read_text().splitlines()[0] + "\n")
+    with pytest.raises(CheckpointError, match=r"expected nothing as psnr, macro: .*, found 2"):
+        table(tmp_path / "runs")
+
+
 def test_times_of_two_devices_are_in_two_columns(tmp_path):
     write_scored(tmp_path / "runs", "3dgs", seconds=7.0)
     write_scored(tmp_path / "runs", "4dgs", seconds=9.0, device="cuda (Test)")
@@ -198,9 +205,8 @@ def test_a_region_has_tables_of_its_own(runs):
     for folder in run_folders(runs):
         run = read_run(folder)
         part = {"aggregates": run.aggregates, "periods": run.periods}
-        write_run(
-            folder, run.model_copy(update={"regions": {"changed": part}, "change_masks": "m"}), []
-        )
+        run = run.model_copy(update={"regions": {"changed": part}, "change_masks": "m"})
+        write_run(folder, run, rows_of(run))
     assert table(runs, "--region", "changed").count("plaza (changed)") >= 2
     with pytest.raises(ConfigError, match="--region invariant: expected runs"):
         table(runs, "--region", "invariant")

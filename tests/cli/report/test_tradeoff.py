@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 from command_line import invoke
-from made_runs import record
+from made_runs import record, rows_of
 
 from chronoscene.cli.report.tradeoff import parse_size
 from chronoscene.errors import ConfigError
@@ -24,7 +24,7 @@ def runs(tmp_path):
         run = record(method, psnr=(psnr,), seconds=seconds, render_seconds=0.1)
         folder = tmp_path / f"runs/plaza/{method}-joint-fast/seed0"
         folder.mkdir(parents=True)
-        write_run(folder, run, [])
+        write_run(folder, run, rows_of(run))
     (tmp_path / "runs/plaza/quick-joint-fast/seed0/curve.csv").write_text(CURVE)
     return tmp_path / "runs"
 
@@ -71,7 +71,8 @@ def test_csv_and_json_parse_back(runs, undrawn):
 def test_infinite_values_are_strings_in_json(runs, undrawn):
     folder = runs / "plaza/exact-joint-fast/seed0"
     folder.mkdir(parents=True)
-    write_run(folder, record("exact", psnr=(float("inf"),), render_seconds=0.1), [])
+    run = record("exact", psnr=(float("inf"),), render_seconds=0.1)
+    write_run(folder, run, rows_of(run))
     text = tradeoff(runs, "--format", "json").stdout
     document = json.loads(text, parse_constant=lambda c: pytest.fail(f"{c} is not JSON"))
     assert "Infinity" in {point["quality"] for point in document["fronts"]}
@@ -95,7 +96,8 @@ def test_options_of_what_limits_leave_out_are_refused(runs, option):
 def test_widths_are_not_compared(runs, undrawn):
     folder = runs / "plaza/quick-joint-fast/seed1"
     folder.mkdir()
-    write_run(folder, record("quick", 1, psnr=(21.0,), max_width=800, render_seconds=0.1), [])
+    run = record("quick", 1, psnr=(21.0,), max_width=800, render_seconds=0.1)
+    write_run(folder, run, rows_of(run))
     text = tradeoff(runs).stdout
     assert "QUICK (joint, fast, max_width=800)" in text
     assert "plaza [width 800]: Pareto fronts" in text
