@@ -511,7 +511,10 @@ def published_notes(table: PublishedTable, records: Sequence[RunRecord]) -> list
         for run in records
         if not (run.protocol or scene_of(run.scene).casefold() in known)
     )
-    notes = [f"published: {table.title}; {table.hardware}. {' '.join(table.notes)}"]
+    notes = [
+        f"published: {table.title}; {table.hardware}. Scenes of equal names may have other photos, "
+        f"test views and sizes. {' '.join(table.notes)}"
+    ]
     if strange:
         scenes = ", ".join(dict.fromkeys(row.scene for row in table.rows))
         notes.append(f"nothing is published of {', '.join(strange)}; the scenes are {scenes}")

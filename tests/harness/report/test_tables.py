@@ -269,6 +269,7 @@ def test_published_rows_stand_below_the_measured_ones_and_are_never_marked():
     assert lines[4] == "| 3DGS (published) | 18.29 | - | - |"
     assert lines[-1] == "| ChronoGS (published) | 22.16 | - | - |" and len(lines) == 12
     assert "- published: ChronoGS: Disentangling" in text
+    assert "Scenes of equal names may have other photos, test views and sizes." in text
     assert "- nothing is published of plaza; the scenes are Lawncourt, " in text
     assert text.count("(published)") == 8  # not in the tables by period
     tests = apart([record(scene="Lawncourt", max_width=width) for width in (160, 320)])
