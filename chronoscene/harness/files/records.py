@@ -12,7 +12,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from itertools import chain
 from pathlib import Path
@@ -383,44 +383,46 @@ def _is_final(folder: Path) -> bool:
     return folder.name.removeprefix("seed").isdigit()
 
 
-def write_summary(runs: Path, without: Collection[Path] = ()) -> list[RunRecord]:
+def write_summary(runs: Path, damaged: dict[Path, str] | None = None) -> list[RunRecord]:
     """Write ``results.json`` and ``rows.csv`` of all finished runs below a folder.
 
     Commands that share the folder do so one after the other: the last one has the runs of all.
 
     Args:
         runs: The folder.
-        without: Runs that are left out.
+        damaged: Gets the runs that cannot be read, with the reason; they are left out, and without
+            any other run nothing is written.
 
     Raises:
-        CheckpointError: If a file of a run is missing or damaged.
+        CheckpointError: If a file of a run is missing or damaged, unless ``damaged`` is given.
     """
     from filelock import FileLock
 
     (runs / LOCKS).mkdir(parents=True, exist_ok=True)
     with FileLock(runs / LOCKS / "summary.lock"):
-        folders = [folder for folder in run_folders(runs) if folder not in without]
-        records = [read_run(folder) for folder in folders]
-        documents = [json.loads(record.model_dump_json()) for record in records]
-        text = json.dumps(documents, indent=1, allow_nan=False) + "\n"
-        write_text_atomic(runs / RESULTS_FILE, text)
-        lines = [",".join((*RUN_COLUMNS, *ROW_COLUMNS)) + "\n"]
-        for folder in folders:
-            rows = read_text(folder / ROWS_FILE, error=CheckpointError)
+        records, lines = [], [",".join((*RUN_COLUMNS, *ROW_COLUMNS)) + "\n"]
+        for folder in run_folders(runs):
+            try:
+                record = read_run(folder)
+                rows = read_text(folder / ROWS_FILE, error=CheckpointError)
+            except CheckpointError as error:
+                if damaged is None:
+                    raise
+                damaged[folder] = str(error)
+                continue
+            records.append(record)
             lines += rows.splitlines(keepends=True)[1:]
-        write_text_atomic(runs / ROWS_FILE, "".join(lines))
+        if records or not damaged:
+            documents = [json.loads(record.model_dump_json()) for record in records]
+            text = json.dumps(documents, indent=1, allow_nan=False) + "\n"
+            write_text_atomic(runs / RESULTS_FILE, text)
+            write_text_atomic(runs / ROWS_FILE, "".join(lines))
     return records
 
 
 def write_summary_of_readable(runs: Path) -> dict[Path, str]:
     """Write the summary without damaged runs, none if there is no other; return why they are."""
-    folders, damaged = run_folders(runs), {}
-    for folder in folders:
-        try:
-            read_run(folder)
-            read_text(folder / ROWS_FILE, error=CheckpointError)
-        except CheckpointError as error:
-            damaged[folder] = str(error)
-    if len(damaged) < len(folders):
-        write_summary(runs, without=damaged)
+    damaged: dict[Path, str] = {}
+    if run_folders(runs):
+        write_summary(runs, damaged)
     return damaged

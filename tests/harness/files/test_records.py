@@ -22,6 +22,7 @@ from chronoscene.harness.files.records import (
     write_failure,
     write_run,
     write_summary,
+    write_summary_of_readable,
 )
 
 JOINT = "ring/mean-joint-balanced/seed0"
@@ -69,7 +70,14 @@ def test_a_summary_has_the_runs_that_another_command_finishes_meanwhile(runs, mo
     first = write_summary(runs)
     others[0].join()
     assert len(json.loads((runs / "results.json").read_text())) == len(first) + 1
-    assert len(write_summary(runs, without=[again])) == len(first)
+
+
+def test_a_summary_reads_each_run_once(runs, monkeypatch):
+    read = []
+    monkeypatch.setattr(records, "read_run", lambda folder: read.append(folder) or read_run(folder))
+    (runs / JOINT / "rows.csv").unlink()
+    assert [*write_summary_of_readable(runs)] == [runs / JOINT]
+    assert read == run_folders(runs) and len(json.loads((runs / "results.json").read_text())) == 3
 
 
 def test_the_summary_is_made_from_the_runs_alone(runs):
