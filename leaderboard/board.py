@@ -118,7 +118,7 @@ def _stand(path: Path, entry: MeasuredEntry, truths: _Truths) -> Standing:
     labels = run.period_labels
     records = [part.record.model_copy(update={"rows": part.rows}) for part in entry.runs]
     claimed = NOT_ASKED
-    if (scene := truths.scene_of(run)) is not None:
+    if (scene := truths.scene_of(path, run)) is not None:
         labels = {str(period.id): period.label for period in scene.periods}
         if labels.keys() != run.period_labels.keys():
             raise refused(path, f"other periods than the {len(labels)} of the scene")
@@ -141,30 +141,36 @@ class _Truths:
     def __init__(self, given: Iterable[tuple[Path, DetectedFormat]], folder: Path) -> None:
         self._folder = folder
         self._given = dict(given)
-        self._scenes: dict[int, dict[_Hashes, Scene]] = {}
+        self._scenes: dict[int, dict[_Hashes, tuple[DetectedFormat, Scene]]] = {}
         self._hashes: dict[Path, set[_Hashes]] = {path: set() for path in self._given}
         self._used: set[_Hashes] = set()
         self._scorers: dict[frozenset[str], Scorers] = {}
         self._read(shrink=1)
 
-    def _read(self, shrink: int) -> dict[_Hashes, Scene]:
+    def _read(self, shrink: int) -> dict[_Hashes, tuple[DetectedFormat, Scene]]:
         """Read all scenes as bench does, once for each divisor of the size of their images."""
         if shrink not in self._scenes:
-            scenes: dict[_Hashes, Scene] = {}
+            scenes = {}
             for path, found in self._given.items():
                 scene = read_bench_scene(found, validation=False, shrink=shrink)
                 hashes = scene_hash(scene), split_hash(scene)
-                scenes[hashes] = scene
+                scenes[hashes] = found, scene
                 self._hashes[path].add(hashes)
             self._scenes[shrink] = scenes
         return self._scenes[shrink]
 
-    def scene_of(self, run: RunRecord) -> Scene | None:
+    def scene_of(self, entry: Path, run: RunRecord) -> Scene | None:
+        """Return the scene of a run as bench had it; errors if its protocol is for no such one."""
         hashes = run.scene_hash, run.split_hash
         protocol = PROTOCOLS.get(run.protocol)
-        scene = self._read(protocol.shrink if protocol else 1).get(hashes)
-        if scene is not None:
-            self._used.add(hashes)
+        known = self._read(protocol.shrink if protocol else 1).get(hashes)
+        if known is None:
+            return None
+        self._used.add(hashes)
+        found, scene = known
+        if protocol is not None and found.name != protocol.format:
+            wrong = f"protocol {run.protocol}, which is for scenes in the format {protocol.format}"
+            raise refused(entry, f"{wrong}, and {found.path} in {found.name}")
         return scene
 
     @property

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import MANIFEST
+from chronoscene.harness.files.protocols import PROTOCOLS
 from chronoscene.harness.files.records import RunRecord, ViewScore, variant_options
 from chronoscene.harness.files.strategies import STRATEGIES
 from chronoscene.harness.report.comparable import KEY
@@ -207,6 +208,8 @@ def _check_texts(record: RunRecord) -> None:
         raise ValueError("scores of validation views: run bench without --validation")
     if record.fitted:
         raise ValueError("scores of halves of photos: run bench without --fit-half")
+    if record.protocol:
+        _check_protocol(record)
     for name in ("scene_hash", "split_hash", "config_hash"):
         if not _HASH.fullmatch(getattr(record, name)):
             raise ValueError(f"{name} is no SHA-256")
@@ -215,6 +218,14 @@ def _check_texts(record: RunRecord) -> None:
             raise ValueError(f"a text with markup, control characters or too long: {leaf[:60]!r}")
     if len(record.device) > 200 or len(record.commit) > 100:  # several if it was resumed
         raise ValueError("a text too long: device or commit")
+
+
+def _check_protocol(record: RunRecord) -> None:
+    protocol = PROTOCOLS.get(record.protocol)
+    if protocol is None:
+        raise ValueError(f"unknown protocol: {record.protocol[:60]!r}")
+    if record.strategy not in protocol.strategies or record.max_width != protocol.max_width:
+        raise ValueError(f"another strategy or width than protocol {record.protocol} has")
 
 
 def _check_numbers(record: RunRecord) -> None:

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
+from filelock import FileLock
 from pydantic import ValidationError
 
 from chronoscene.errors import ConfigError
@@ -35,6 +36,8 @@ from leaderboard.entries import (
 )
 from leaderboard.verification import check_values
 
+LOCK = ".lock"
+
 
 def submit(folders: Iterable[Path], to: Path) -> list[Path]:
     """Add runs to the entries of a folder; a run of a seed that is there replaces it.
@@ -55,10 +58,17 @@ def submit(folders: Iterable[Path], to: Path) -> list[Path]:
         CheckpointError: If a run is damaged, or its images are not those that its manifest lists.
         ConfigError: If a run cannot be what it says, or the file of an entry that is there.
     """
+    runs = [(folder, entry_run(folder)) for given in folders for folder in _runs_of(given)]
+    to.mkdir(parents=True, exist_ok=True)
+    with FileLock(to / LOCK):  # another command may add a seed to the same entry
+        return _add(runs, to)
+
+
+def _add(given: Iterable[tuple[Path, EntryRun]], to: Path) -> list[Path]:
+    """Add runs, each with its folder, to the entries that are there."""
     entries: dict[Path, MeasuredEntry] = {}
     sources: dict[Path, Path] = {}
-    for folder in (run for given in folders for run in _runs_of(given)):
-        run = entry_run(folder)
+    for folder, run in given:
         path = to / file_name(run)
         known = entries.get(path) or (read_entry(path) if path.exists() else None)
         by_seed = {r.record.seed: r for r in (*(known.runs if known else ()), run)}

@@ -11,6 +11,7 @@ from made_runs import record, write_scored
 from chronoscene.formats import read_scene
 from chronoscene.harness.files.ground_truth import freeze_ground_truth
 from chronoscene.harness.files.predictions import ImageWriter, load_image
+from chronoscene.harness.files.protocols import PROTOCOLS
 from chronoscene.harness.files.provenance import scene_hash
 from chronoscene.harness.files.records import PREDICTIONS, write_run
 from chronoscene.harness.score.scoring import rescore
@@ -75,7 +76,8 @@ def write_noisy(
     """A run without scores, whose predictions are photos with noise."""
     hashes = {"scene_hash": scene_hash(scene), "split_hash": split_hash(scene)}
     run = record(
-        method, seed, scene=scene.name, config_hash="c" * 64, max_width=1600, commit="1" * 40,
+        method, seed, scene=scene.name, config_hash="c" * 64, commit="1" * 40,
+        max_width=PROTOCOLS[protocol].max_width if protocol else 1600,
         period_labels={str(p.id): p.label for p in scene.periods}, iterations=1000,
         protocol=protocol, **hashes,
     )  # fmt: skip

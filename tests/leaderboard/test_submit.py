@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from threading import Thread
 
 import pytest
 
@@ -11,7 +12,7 @@ from chronoscene.harness.files.records import read_rows, read_run, write_run
 from chronoscene.harness.score.scoring import aggregate
 from leaderboard.board import read_board
 from leaderboard.entries import predictions_folder, read_entry
-from leaderboard.submit import submit
+from leaderboard.submit import _copy_predictions, submit
 
 
 def test_seeds_extend_an_entry_and_replace_themselves(make_run, enter, tmp_path):
@@ -40,6 +41,23 @@ def test_a_folder_of_runs_gives_an_entry_per_setting(make_run, enter, tmp_path):
     written = enter([tmp_path / "runs"], tmp_path / "entries")
     assert len({*written}) == 3
     assert sorted(len(read_entry(path).runs) for path in written) == [1, 1, 2]
+
+
+def test_two_commands_at_a_time_add_both_of_their_runs(honest, tmp_path, monkeypatch):
+    runs = [honest / f"runs/yard/3dgs-joint-fast/seed{i}" for i in (0, 1)]
+    to, others = tmp_path / "entries", []
+
+    def copy(source, place):
+        if not others:  # the entries are read by now
+            others.append(Thread(target=submit, args=[runs[1:], to]))
+            others[0].start()
+            others[0].join(2)
+        return _copy_predictions(source, place)
+
+    monkeypatch.setattr("leaderboard.submit._copy_predictions", copy)
+    (path,) = submit(runs[:1], to)
+    others[0].join()
+    assert [run.record.seed for run in read_entry(path).runs] == [0, 1]
 
 
 def test_options_with_several_values_are_entered(make_run, enter, tmp_path):
@@ -96,7 +114,7 @@ def test_a_run_without_values_of_a_view_that_counts_is_refused(make_run, tmp_pat
     record = read_run(run)
     record.aggregates, record.periods = aggregate(rows)
     write_run(run, record, rows)
-    with pytest.raises(ConfigError, match=r"no values of '1/view2\.png', whose photo has"):
+    with pytest.raises(ConfigError, match=r"values of '1/view2\.png', whose photo .*found none;"):
         submit([run], tmp_path / "entries")
 
 
@@ -127,7 +145,8 @@ def test_values_that_are_not_those_of_the_images_are_refused(honest, tmp_path):
     rows = [replace(row, value=row.value + (row.metric == "psnr")) for row in rows]
     record.aggregates, record.periods = aggregate(rows)
     write_run(run, record, rows)
-    with pytest.raises(ConfigError, match=r"seed 0: psnr 1\d\.\d* for '0/0.png', whose image has"):
+    text = r"seed0, seed 0: expected psnr 1\d\.\d* for '0/0.png', as its image has, found 1\d\.\d*;"
+    with pytest.raises(ConfigError, match=text):
         submit([run], tmp_path / "entries")
     assert not (tmp_path / "entries").exists()
 
