@@ -27,6 +27,7 @@ from chronoscene.fields.rows import part_rows
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
 from chronoscene.training import devices
 from chronoscene.training.checkpoint import (
+    MISFITS,
     TRAINING,
     check_finite,
     load_tensors,
@@ -358,7 +359,7 @@ class FieldMethod(ABC):
                 periods, self.meta["cells"], self.config.spacing, grids, device
             )
             self.network = self.network_class(self.config, tensors)
-        except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        except MISFITS as error:
             raise misfit(folder, "tensors and a description that fit together", error) from error
         self.optimizer = None
 
@@ -382,7 +383,7 @@ class FieldMethod(ABC):
             for i, name in enumerate(_GRIDS):
                 self.occupancy.densities[i][:] = tensors[f"density.{name}"]
                 self.occupancy.grids[i][:] = tensors[f"grid.{name}"]
-        except (KeyError, RuntimeError, ShapeError, ValueError) as error:
+        except (*MISFITS, ShapeError) as error:
             expected = f"a training that {self.name} {self.version} can go on with"
             raise misfit(folder, expected, error) from error
 

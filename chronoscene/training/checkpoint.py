@@ -30,6 +30,8 @@ from chronoscene.io.wording import shown
 TRAINING = "training"
 """Stem of the files that hold a training."""
 FORMAT_VERSION = 1
+MISFITS = (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError)
+"""Errors of code that is given tensors and values that do not go together; see `misfit`."""
 DAMAGED = "the file is damaged or was edited: copy it again or train again"
 
 

@@ -21,6 +21,7 @@ from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet,
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import (
+    MISFITS,
     TRAINING,
     TrainingState,
     check_finite,
@@ -207,7 +208,7 @@ class SplattingMethod(ABC):
             background = torch.tensor(self.meta["background"], dtype=torch.float32, device=device)
             self.background, self._exposure = background, tensors.pop(_EXPOSURE, None)
             self.restore(folder, tensors, device)
-        except (IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        except MISFITS as error:
             raise misfit(folder, "tensors and a description that fit together", error) from error
         self.trainer = None
 
@@ -222,7 +223,7 @@ class SplattingMethod(ABC):
         tensors, meta = load_tensors(folder, method=self.name, stem=TRAINING)
         try:
             self.trainer.load_state(TrainingState(tensors, meta["values"]))
-        except (KeyError, RuntimeError, ShapeError) as error:
+        except (*MISFITS, ShapeError) as error:
             expected = f"a training that {self.name} {self.version} can go on with"
             todo = "go on with the version of the software, and on the device, that began it"
             raise misfit(folder, expected, error, todo) from error

@@ -1,5 +1,6 @@
 """Saving and loading; what a method with a deformation field reuses."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -56,6 +57,16 @@ def test_a_description_that_does_not_fit_is_refused(tmp_path):
     method.save(tmp_path)
     with pytest.raises(CheckpointError, match="fit together, found TypeError"):
         GaussianSplatting(GaussianConfig()).load(tmp_path, device="cpu")
+
+
+@pytest.mark.parametrize("values", [None, [], {"views_per_step": 1}])
+def test_a_training_that_does_not_fit_is_refused(values, tmp_path):
+    method = train(toy_scene(), replace(SHORT, iterations=1))
+    method.save_training(tmp_path)
+    path = tmp_path / "training.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"values": values}))
+    with pytest.raises(CheckpointError, match=r"expected a training that .* found \w+Error"):
+        method.load_training(tmp_path)
 
 
 def test_a_near_plane_is_trained_stored_and_rendered_with(tmp_path):

@@ -15,19 +15,21 @@ import time
 from dataclasses import dataclass
 from json import dumps
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
 from chronoscene.errors import CheckpointError, DiskFullError
 from chronoscene.harness.files.provenance import peak_memory_bytes
 from chronoscene.harness.files.records import CONFIG_FILE, CurvePoint
+from chronoscene.io.documents import plain_file
 from chronoscene.io.log import Log
 from chronoscene.io.staging import partial_name, remove_abandoned, sha256_of, write_text_atomic
 from chronoscene.methods import Method
 
 LOOP_FILE = "loop.json"
+_Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class LoopState(BaseModel):
@@ -36,12 +38,12 @@ class LoopState(BaseModel):
     model_config = ConfigDict(extra="forbid", ser_json_inf_nan="strings")
 
     format_version: Literal[1] = 1
-    iterations: int = 0
+    iterations: NonNegativeInt = 0
     """Steps done; one of several views counts as so many, here and below."""
-    seconds: float = 0.0
+    seconds: _Seconds = 0.0
     """Time on the training clock."""
-    setup_seconds: float = 0.0
-    waited_seconds: float = 0.0
+    setup_seconds: _Seconds = 0.0
+    waited_seconds: _Seconds = 0.0
     """Time spent waiting for photos, or stopped; not on the training clock."""
     empty_steps: int = 0
     """Steps whose view showed no primitive."""
@@ -103,10 +105,10 @@ class Checkpoints:
             try:
                 state = _read(folder)
                 method.load_training(folder)
+                _set_random_state(folder, state.random_state)
             except CheckpointError as error:
                 problems.append(error)
                 continue
-            _set_random_state(state.random_state)
             state.resumed += 1
             for problem in problems:
                 self.log(f"note: a checkpoint is not used: {problem}")
@@ -172,7 +174,7 @@ def _read(folder: Path) -> LoopState:
     """Read the state of the loop and check the files of a checkpoint."""
     path = folder / LOOP_FILE
     try:
-        state = LoopState.model_validate_json(path.read_bytes())
+        state = LoopState.model_validate_json(plain_file(path).read_bytes())
         for name, digest in state.files.items():
             path = folder / Path(name).name
             if sha256_of(path) != digest:
@@ -180,7 +182,10 @@ def _read(folder: Path) -> LoopState:
     except OSError as error:
         raise _damaged(path, error.strerror or str(error)) from error
     except ValidationError as error:
-        raise _damaged(path, error.errors()[0]["msg"]) from error
+        first = error.errors()[0]
+        raise _damaged(path, f"{first['msg']} ({'.'.join(map(str, first['loc']))})") from error
+    except ValueError as error:  # a name that no file can have
+        raise _damaged(path, str(error)) from error
     return state
 
 
@@ -213,13 +218,18 @@ def _random_state() -> dict[str, Any]:
     }
 
 
-def _set_random_state(state: dict[str, Any]) -> None:
+def _set_random_state(folder: Path, state: dict[str, Any]) -> None:
+    """Set the global generators to the state in a checkpoint."""
     import torch
 
-    version, numbers, gauss = state["python"]
-    random.setstate((version, tuple(numbers), gauss))
-    np.random.set_state(tuple(state["numpy"]))
-    torch.set_rng_state(torch.frombuffer(bytearray.fromhex(state["torch"]), dtype=torch.uint8))
-    if "cuda" in state and torch.cuda.is_available():
-        cuda = torch.frombuffer(bytearray.fromhex(state["cuda"]), dtype=torch.uint8)
-        torch.cuda.set_rng_state(cuda)
+    try:
+        version, numbers, gauss = state["python"]
+        random.setstate((version, tuple(numbers), gauss))
+        np.random.set_state(tuple(state["numpy"]))
+        torch.set_rng_state(torch.frombuffer(bytearray.fromhex(state["torch"]), dtype=torch.uint8))
+        if "cuda" in state and torch.cuda.is_available():
+            cuda = torch.frombuffer(bytearray.fromhex(state["cuda"]), dtype=torch.uint8)
+            torch.cuda.set_rng_state(cuda)
+    except (KeyError, OverflowError, RuntimeError, TypeError, ValueError) as error:
+        found = f"{type(error).__name__}: {error} (random_state)"
+        raise _damaged(folder / LOOP_FILE, found) from error

@@ -112,6 +112,28 @@ def test_a_damaged_one_gives_way_to_the_one_before(make, file, damage):
         restored(make())
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"random_state": {}},
+        {"random_state": {"python": [3, [1], None], "numpy": [], "torch": ""}},
+        {"random_state": {"python": None}},
+        {"iterations": -1},
+        {"seconds": "NaN"},
+        {"files": {"a\0b": ""}},
+        {"files": {"..": ""}},
+    ],
+    ids=str,
+)
+def test_a_state_that_no_training_has_gives_way_to_the_one_before(make, change):
+    checkpoints = make()
+    write(checkpoints, 3, 4)
+    path = checkpoints.folder / "4/loop.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    assert restored(make()) == 3
+    assert f"a checkpoint is not used: {checkpoints.folder / '4'}" in make.said[0]
+
+
 def test_a_kill_at_any_moment_leaves_a_whole_one(make, monkeypatch):
     """Every call that changes the disk for good is the last one."""
     for number in range(100):
