@@ -258,12 +258,14 @@ def test_a_link_to_the_first_run_leaves_another_one():
         const app = Object.create(App.prototype), view = { eye: [0, 0, 0], distance: 1 };
         view.rotation = [1, 0, 0, 0, 1, 0, 0, 0, 1];
         app.scene = { periods: ["x"], runs: [{}, {}], frames: [] };
-        Object.assign(app, { mode: "years", period: 0, frame: null, view });
+        Object.assign(app, { mode: "years", period: 0, frame: null, view, flight: {} });
         app.leave = app.setMode = () => {};
         const links = [0, 1].map(run => "#" + addressOf({ ...app, run }));
         const opened = hash => { location.hash = hash; app.applyAddress(); return app.run; };
-        console.log(opened(links[1]), opened(links[0]));"""
-    assert in_node("vectors", "link", "app", first=first, then=then) == "1 0\n"
+        console.log(opened(links[1]), opened(links[0]), app.flight);"""
+    assert in_node("vectors", "link", "app", first=first, then=then) == "1 0 null\n", (
+        "or it flies on"
+    )
 
 
 def test_a_link_to_a_photo_beside_another_period():

@@ -249,6 +249,7 @@ class App {
   /** Show what the address asks for. */
   applyAddress() {
     const problems = [], state = stateFrom(location.hash.slice(1), this.scene, problems);
+    this.flight = null;
     if (state.view) this.view = { ...this.scene.home, ...state.view };
     if (state.frame) this.visit(state.frame);  // goes to its period, which may not be the one shown
     else this.leave();
