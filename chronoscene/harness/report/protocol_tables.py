@@ -41,7 +41,7 @@ def _measured(name: str, records: Sequence[RunRecord]) -> Iterator[ProtocolRow]:
     for run in records:
         if run.protocol == name:
             scenes = groups.setdefault(name_of(run), {})
-            scenes.setdefault(run.scene, []).append(run)
+            scenes.setdefault(run.scene_hash, []).append(run)  # one may have several names
     for label, scenes in groups.items():
         values: dict[str, float | None] = {}
         for metric in PROTOCOLS[name].metrics:

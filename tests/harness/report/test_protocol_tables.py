@@ -10,7 +10,7 @@ from chronoscene.harness.report.tables import format_runs
 
 
 def wat(scene, psnr, ssim=0.75, **changes):
-    fields = {"protocol": "wat", "variant": "protocol=wat", **changes}
+    fields = {"protocol": "wat", "variant": "protocol=wat", "scene_hash": scene, **changes}
     scores = {"psnr": (psnr - 1, psnr + 1), "ssim": ssim and (ssim, ssim)}
     return record("clnerf", scene=scene, **scores, **fields)
 
@@ -36,6 +36,13 @@ def test_printed_rows_stand_below_the_measured_mean():
     assert "nothing is published of" not in table
 
 
+def test_a_scene_with_two_names_counts_once():
+    runs = [wat("spa", 20.0), wat("bath", 21.0, scene_hash="spa"), wat("grill", 25.5)]
+    text = format_runs(apart(runs), [], "json", published=load_published())
+    row = json.loads(text)["protocols"][0]
+    assert row["scenes"] == 2 and row["values"]["psnr"] == 23.0
+
+
 def test_a_metric_that_was_not_computed_is_a_dash():
     run = wat("spa", 20.0, ssim=None)
     table = format_runs([run], [], "markdown", published=load_published())
@@ -48,7 +55,8 @@ def test_without_a_protocol_nothing_is_added():
 
 
 def test_runs_under_a_protocol_are_compared_with_each_other_alone():
-    runs = [wat("spa", 20.0), wat("spa", 21.0, seed=1), record("clnerf", scene="spa")]
+    runs = [wat("spa", 20.0), wat("spa", 21.0, seed=1)]
+    runs.append(record("clnerf", scene="spa", scene_hash="spa"))
     assert sorted(len(group) for group in comparable(runs).values()) == [1, 2]
     names = [run.scene for run in apart(runs)]
     assert names == ["spa [protocol wat]", "spa [protocol wat]", "spa [protocol none]"]
