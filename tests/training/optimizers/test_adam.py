@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chronoscene.errors import ShapeError
+from chronoscene.training.optimizers import adam as module
 from chronoscene.training.optimizers.adam import BLOCK, Adam, Pace, all_finite, step_fused
 
 # Worst of 1200 runs of 20 steps with rates up to 0.1: 1.7e-6, from rounding in another order.
@@ -68,6 +70,23 @@ def test_large_array_equals_torch_and_any_thread_count(threads: Callable[[int], 
         reference.grad = gradient(reference, index)
         torch_adam.step()
     torch.testing.assert_close(results[0], reference.detach(), atol=TOLERANCE, rtol=TOLERANCE)
+
+
+def test_a_small_update_compiles_that_of_large_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warm-ups have small ones only; a training must not compile on its clock."""
+    calls = []
+
+    def large(*arrays: np.ndarray) -> None:
+        calls.append([array.shape for array in arrays])
+
+    large.signatures = calls  # type: ignore[attr-defined]
+    monkeypatch.setattr(module, "adam_tensors", large)
+    value = leaf(5)
+    adam = Adam({"x": value})
+    for index in range(2):
+        value.grad = gradient(value, index)
+        adam.step({"x": 0.1})
+    assert calls == [[(0, 4), (1,), (0,), (0, module.SCALARS)]]
 
 
 def test_tensors_together_have_the_bits_of_each_alone() -> None:
