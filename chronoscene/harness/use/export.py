@@ -253,7 +253,7 @@ def _comments(
     if prepared.offset.any():
         lines.append(_describe_offset(scene, prepared.offset))
     if format == "spz" and (far := spz.count_far(prepared.cloud)):
-        lines.append(f"Moved nearer, as SPZ has not the range: {counted(far, 'Gaussian')} far away")
+        lines.append(f"{counted(far, 'Gaussian')} far from all others moved to the limits of SPZ")
     return tuple(printable(line).encode("ascii", "replace").decode() for line in lines)
 
 

@@ -12,7 +12,7 @@ def test_from_a_run_to_a_site(tmp_path):
     rescore(tmp_path / "runs", make_scorers(["psnr"]))
     done = invoke("submit", tmp_path / "runs", "--to", tmp_path / "entries")
     assert done.exit_code == 0, done.output
-    (entry,) = (tmp_path / "entries").iterdir()
+    (entry,) = (tmp_path / "entries").glob("*/*.json")
     assert f"wrote {entry}" in done.stderr
     (tmp_path / "entries/bad.json").write_text("{}")
     done = invoke("leaderboard", tmp_path / "entries", "--out", tmp_path / "site")

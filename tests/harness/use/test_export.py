@@ -165,6 +165,10 @@ def test_large_coordinates_lose_an_offset_that_is_written_down(trained, tmp_path
     assert f"Add {numbers} to coordinates of this file for those of the scene" in made.comments
     whole = exporting.make_file(run, scene, 0.0, exporting.prepare(run, scene, 0.0), "spz")
     assert made.loss.plain == pytest.approx(whole.loss.plain, abs=0.02)
+    prepared.cloud.means[0] = 1e8
+    note = "1 Gaussian far from all others moved to the limits of SPZ"
+    assert note in exporting.make_file(moved, utm, 0.0, prepared, "spz").comments
+    assert note not in made.comments
 
 
 def test_an_exposure_does_not_reach_the_background(trained, tmp_path):
