@@ -229,9 +229,8 @@ def apply_updates(updates: Iterable[Update]) -> None:
     sizes = np.array([u.value.numel() for u in compiled])
     # Starting the threads costs more than a small update.
     run = adam_tensors if sizes.max() > BLOCK else adam_tensors_alone
-    if (
-        not adam_tensors.signatures
-    ):  # a warm-up has small updates only, and compiles for larger ones
+    # A warm-up has small updates alone, and is to compile what the training needs.
+    if not adam_tensors.signatures:
         adam_tensors(addresses[:0], _block_starts(sizes[:0]), sizes[:0], scalars[:0])
     run(addresses, _block_starts(sizes), sizes, scalars)
 
