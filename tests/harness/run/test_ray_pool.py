@@ -1,10 +1,15 @@
-"""Runs on a Ray cluster of several machines, one of which sees none of the others' files."""
+"""Runs on a Ray cluster of several machines, one of which sees none of the others' files.
+
+By default, a stand-in for Ray does at once in this process what it is told; starting a cluster
+takes half a minute.
+"""
 
 import os
 import signal
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import Future
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -19,17 +24,23 @@ from chronoscene.harness.files.source import RunOrigin
 from chronoscene.harness.plan.settings import bench_settings
 from chronoscene.harness.run import ray_pool
 from chronoscene.harness.run.runner import run_bench
+from chronoscene.harness.train.worker import execute
 from chronoscene.io.processes import process_tree
 
 from ..plan.test_job import JOB
 
-pytest.importorskip("ray")
 NODE = {"object_store_memory": 80_000_000, "include_dashboard": False}
+
+ON_RAY = pytest.mark.parametrize(
+    "address", [pytest.param("ray", marks=pytest.mark.slow)], indirect=True
+)
+"""For what needs the processes of a cluster."""
 
 
 @pytest.fixture(scope="module")
 def cluster(toys, tmp_path_factory):
     """Two machines with one processor each, which share our files."""
+    pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory(prefix="ray") as place:
@@ -60,8 +71,67 @@ def bounded():
     signal.signal(signal.SIGALRM, before)
 
 
+class StandIn:
+    """What `RayPool` uses of Ray; two machines of one processor."""
+
+    exceptions = SimpleNamespace(RayError=ConnectionError, RayActorError=ConnectionResetError)
+
+    def init(self, address, **options):
+        assert address == "auto"
+
+    def shutdown(self):
+        pass
+
+    def nodes(self):
+        return [{"Alive": True, "Resources": {"CPU": 1.0, "memory": 1e9}}] * 2
+
+    def remote(self, kind):
+        return SimpleNamespace(
+            options=lambda **needs: SimpleNamespace(remote=lambda: Actor(kind()))
+        )
+
+    def wait(self, references, timeout):
+        return references, []
+
+    def get(self, reference):
+        return reference.result()
+
+    def kill(self, actor):
+        pass
+
+
+class Actor:
+    """The methods of an object, called by ``remote``."""
+
+    def __init__(self, owner):
+        self.owner = owner
+
+    def __getattr__(self, name):
+        def call(*arguments):
+            done = Future()
+            try:
+                done.set_result(getattr(self.owner, name)(*arguments))
+            except Exception as error:
+                done.set_exception(error)
+            return done
+
+        return SimpleNamespace(remote=call)
+
+
+@pytest.fixture(params=["stand-in", pytest.param("ray", marks=pytest.mark.slow)])
+def address(request, monkeypatch):
+    """The address of a cluster."""
+    if request.param == "ray":
+        return request.getfixturevalue("cluster").address
+    monkeypatch.setattr(ray_pool, "import_extra", lambda *names: StandIn())
+    monkeypatch.setattr(
+        ray_pool, "run_staged", lambda job, report, stop: execute(job.document(), report)
+    )
+    return "auto"
+
+
 @pytest.fixture
-def on_ray(cluster, scene_folder, tmp_path):
+def on_ray(address, scene_folder, tmp_path):
     """Run a bench on the cluster; returns its outcome and what it said."""
 
     def run(*methods, **changes):
@@ -72,7 +142,7 @@ def on_ray(cluster, scene_folder, tmp_path):
             "runs": tmp_path / "runs",
             "threads": 1,
             "job_memory": 10**8,
-            "ray": cluster.address,
+            "ray": address,
         }
         return run_bench(bench_settings(**{**settings, **changes}), said.append), said
 
@@ -115,7 +185,7 @@ def test_results_are_those_of_a_local_run(on_ray, scene_folder, tmp_path, method
     assert longer.failures == () and read_run(longer.finished[0]).iterations == 20
 
 
-@pytest.mark.slow
+@ON_RAY
 def test_a_run_that_fails_stops_nobody_else(on_ray):
     outcome, said = on_ray("FULL_DISK", "RAISES", "KILLED", "ORPHANED", "MEAN")
     assert [folder.parent.name for folder in outcome.finished] == ["mean-joint-balanced"]
@@ -132,7 +202,7 @@ def test_a_run_that_fails_stops_nobody_else(on_ray):
     assert wanted in outcome.failures[0].reason
 
 
-@pytest.mark.slow
+@ON_RAY
 def test_other_code_is_told_and_another_version_refused(on_ray, monkeypatch):
     monkeypatch.setattr(ray_pool, "code_version", lambda: "another")
     outcome, said = on_ray("MEAN", seeds=(0, 1))
@@ -177,7 +247,7 @@ def workers():
     return found
 
 
-@pytest.mark.slow
+@ON_RAY
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_runs_end_with_their_bench(number, on_ray, cluster, scene_folder, tmp_path):
     runs, hold = tmp_path / "runs", cluster.hold
@@ -202,6 +272,7 @@ def test_runs_end_with_their_bench(number, on_ray, cluster, scene_folder, tmp_pa
 
 @pytest.mark.slow
 def test_without_ray_or_a_cluster(scene_folder, tmp_path, monkeypatch):
+    pytest.importorskip("ray")
     settings = bench_settings(
         (scene_folder,), ("toy_methods:MEAN",), tmp_path / "runs", ray="127.0.0.1:1"
     )
@@ -216,7 +287,6 @@ def test_without_ray_or_a_cluster(scene_folder, tmp_path, monkeypatch):
     assert not list(tmp_path.rglob("*.token"))
 
 
-@pytest.mark.slow
 def test_runs_get_what_the_machines_of_a_cluster_have(tmp_path):
     machines = [{"CPU": 16.0, "GPU": 1.0}, {"CPU": 6.0}, {"memory": 1.0}]
     nodes = [{"Alive": True, "Resources": machine} for machine in machines]
