@@ -36,11 +36,12 @@ from chronoscene.methods import (
 )
 from chronoscene.training import devices, sparse_depth
 
-from .small_fields import SAME_NETWORKS, SMALL_FIELD
+from .small_fields import SMALL_FIELD
 
 STEPS = 3
-TRAINED = PAUSE + 12
-"""Steps of the trainings that go from one device to another."""
+FIELD_PAUSE = 24
+"""Steps of a field until it is saved; it has no densification to wait for."""
+AFTER_PAUSE = 12
 EPS = 1e-4
 """Of Adam, where trainings are compared."""
 LOSS_TOLERANCE = {"cpu": 1e-6, "cuda": 1e-4}
@@ -63,11 +64,13 @@ def depth_in_every_step() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def two_threads() -> None:
-    """Sums of torch have other bits on one processor: a Gaussian of 4dgs ends so close to the
-    opacity below which none is drawn that only one of both ways draws it."""
-    torch.set_num_threads(2)
+def is_quick(name: str) -> bool:
+    """One field is enough by default: plain torch is slow, and `tests/fields/test_plain_torch.py`
+    compares each with its kernels. Two methods have the code of ``3dgs`` and of
+    ``scaffold-gs-period``."""
+    if load_spec(name).mixes_views:
+        return name == "nerf-w-t"
+    return name not in ("3dgs-period", "scaffold-gs")
 
 
 @dataclass
@@ -78,6 +81,11 @@ class Compiled:
     data: TrainingSet
     trainings: dict[str, Training] = field(default_factory=dict)
     """By device."""
+
+    @property
+    def pause(self) -> int:
+        """Steps after which a training is saved on its way."""
+        return FIELD_PAUSE if self.spec.mixes_views else PAUSE
 
     def method(self, device: str = "cpu") -> Method:
         """At the start of a training with as many options as all methods have."""
@@ -99,7 +107,7 @@ class Compiled:
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param(name, marks=[pytest.mark.slow] if name in SAME_NETWORKS else [])
+        pytest.param(name, marks=[] if is_quick(name) else pytest.mark.slow)
         for name in method_names()
         if "cuda" in load_spec(name).devices
     ],
@@ -131,6 +139,14 @@ GPU = pytest.param(
 )
 
 
+@pytest.fixture
+def two_threads(compiled: Compiled) -> None:
+    """Sums of torch have other bits on one processor: a Gaussian of 4dgs ends so close to the
+    opacity below which none is drawn that only one of both ways draws it. Beside other tests,
+    two threads take longer than one."""
+    torch.set_num_threads(2 if compiled.spec.name == "4dgs" else 1)
+
+
 @pytest.fixture(params=["cpu", GPU])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """A GPU, or a CPU that runs what a GPU would."""
@@ -148,7 +164,7 @@ class Training:
     method: Method
     reports: list[StepReport]
     saved: Path
-    """Folder of the training after `PAUSE` steps."""
+    """Folder of the training after `Compiled.pause` steps."""
 
     def resumed(self, compiled: Compiled, device: str) -> Method:
         """Return a new method with the saved training."""
@@ -165,8 +181,8 @@ def training(compiled: Compiled, device: str, tmp_path_factory: pytest.TempPathF
     if device not in compiled.trainings:
         method, saved = compiled.method(device), tmp_path_factory.mktemp("saved")
         reports = []
-        for i in range(TRAINED):
-            if i == PAUSE and compiled.spec.resumable:
+        for i in range(compiled.pause + AFTER_PAUSE):
+            if i == compiled.pause and compiled.spec.resumable:
                 method.save_training(saved)
             reports.append(method.step(i, i / tiny_training.STEPS))
         compiled.trainings[device] = Training(method, reports, saved)
@@ -237,10 +253,10 @@ def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
 def test_a_training_goes_on_where_it_was_saved(
     compiled: Compiled, training: Training, device: str
 ) -> None:
-    resumed = training.resumed(compiled, device)
-    report = resumed.step(PAUSE, PAUSE / tiny_training.STEPS)
-    assert report.primitives == training.reports[PAUSE].primitives
-    assert report.loss == pytest.approx(training.reports[PAUSE].loss, rel=LOSS_TOLERANCE[device])
+    pause, resumed = compiled.pause, training.resumed(compiled, device)
+    report = resumed.step(pause, pause / tiny_training.STEPS)
+    assert report.primitives == training.reports[pause].primitives
+    assert report.loss == pytest.approx(training.reports[pause].loss, rel=LOSS_TOLERANCE[device])
 
 
 def test_a_training_of_another_device_goes_on_or_is_refused(
@@ -285,7 +301,7 @@ def test_a_step_asks_a_gpu_little_and_gets_no_table(
     """As asked on a CPU, except by what is of the CPU alone."""
     method = training.resumed(compiled, device)
     found = count_questions(monkeypatch)
-    for i in (PAUSE, PAUSE + 1):
+    for i in (compiled.pause, compiled.pause + 1):
         found.clear()
         method.step(i, i / tiny_training.STEPS)
         allowed = QUESTIONS + MORE_QUESTIONS.get(compiled.spec.name, 0)
