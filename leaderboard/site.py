@@ -180,7 +180,7 @@ class _Site:
 
     def _method_page(self, method: str, file: str) -> None:
         printed = self.printed[self.printed.method == method]
-        of_paper = dict(printed.query("quantity == 'psnr'")[["scene", "mean"]].to_numpy())
+        of_paper = dict(printed[printed.quantity == "psnr"][["scene", "mean"]].to_numpy())
         measured: list[dict[str, Any]] = []
         for kind, found in self.groups.items():
             for setting, part in found.items():
@@ -242,8 +242,8 @@ def _measured(
     ``of_paper``: PSNR that was printed, by scene.
     """
     printed = of_paper.get(setting.scene) if kind == VERIFIED else None
-    chosen = part.values.query("quantity == 'psnr' and column == 'macro' and method == @method")
-    for row in chosen.itertuples():
+    values = part.values[part.values.method == method]
+    for row in values[(values.quantity == "psnr") & (values.column == "macro")].itertuples():
         run = next(r for r in part.runs if (r.method, r.config_hash) == (method, row.config_hash))
         yield {
             "scene": setting.scene,

@@ -137,15 +137,17 @@ def make_rows(
     part: DataFrame, columns: Sequence[Column], *, by: str = "label", ranked: bool = True
 ) -> list[dict[str, Any]]:
     """Make the rows of a table, one per label or per scene."""
+    groups: dict[str, list[Any]] = {}
+    for row in part.itertuples(index=False):
+        groups.setdefault(getattr(row, by), []).append(row)
     rows = []
-    for name, own in part.groupby(by, sort=False):
-        found = {(row.quantity, row.column): row for row in own.itertuples()}
+    for name, own in groups.items():
+        found = {(row.quantity, row.column): row for row in own}
         cells = [
             make_cell(found[q, c], ranked=ranked) if (q, c) in found else None
             for q, c, _ in columns
         ]
-        first = own.iloc[0]
-        rows.append({by: name, "method": first.method, "seeds": first.seeds, "cells": cells})
+        rows.append({by: name, "method": own[0].method, "seeds": own[0].seeds, "cells": cells})
     return rows
 
 
