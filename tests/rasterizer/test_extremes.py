@@ -163,8 +163,8 @@ def test_bits_do_not_depend_on_the_number_of_threads(extreme: Extreme, threads: 
 def test_the_reference_itself_is_right(extreme: Extreme) -> None:
     """Against 60 digits, at pixels all over the image, to the rounding of its largest number."""
     scene = extreme.build()
-    step = max(6, scene.width // 8)
-    pixels = [(x, y) for y in range(0, scene.height, 5) for x in range(0, scene.width, step)]
+    step = max(9, scene.width // 6)
+    pixels = [(x, y) for y in range(0, scene.height, 7) for x in range(0, scene.width, step)]
     result = scene.render("reference", torch.float64)[0]
     values = torch.cat([result.image, result.alphas], dim=-1)[0].detach().numpy()
     got = np.array([values[y, x] for x, y in pixels])
