@@ -289,7 +289,7 @@ def test_order_of_the_input_does_not_matter(tools: SimpleNamespace) -> None:
 @pytest.mark.parametrize("antialiased", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_gradcheck(antialiased: bool, tools: SimpleNamespace) -> None:
     """Finite differences of every input, at pixels that no threshold is near to."""
-    scene = tools.random_scene(7, 13, 11, seed=4)
+    scene = tools.random_scene(7, 9, 8, seed=4)
     scene = scene.with_(
         opacities=np.array([0.9, 0.8, 0.3, 0.6, 0.99, 0.5, 0.95], np.float32),
         scales=scene.scales * 3,
@@ -309,8 +309,8 @@ def test_gradcheck(antialiased: bool, tools: SimpleNamespace) -> None:
             *args[:5],
             viewmats,
             Ks,
-            13,
-            11,
+            9,
+            8,
             backgrounds=args[5],
             render_depth=True,
             antialiased=antialiased,

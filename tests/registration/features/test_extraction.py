@@ -14,7 +14,6 @@ import pytest
 from PIL import Image
 
 from chronoscene.errors import RegistrationError
-from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.features import correspondences, extraction
@@ -25,11 +24,7 @@ from chronoscene.registration.features.matching import match
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.photos.inputs import gather
 from chronoscene.registration.work_folder import TASKS, Stages, work_folder
-from chronoscene.synth import SynthSettings, generate
-
-SETTINGS = SynthSettings(
-    periods=1, width=320, height=240, views=6, points=600, blocks=2, supersample=1
-)
+from chronoscene.scene import Scene
 
 ALL = ["0.jpg", "1.jpg", "2.jpg", "3.jpg", "4.jpg", "5.jpg"]
 
@@ -112,14 +107,12 @@ def exactly(geometry: Any) -> tuple[Any, ...]:
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("generated")
-    generate(root / "scene", SETTINGS)
-    scene = read_scene(root / "scene")
-    (root / "photos").mkdir()
-    for name, frame in zip(ALL, scene.frames, strict=False):
-        shutil.copyfile(scene.image_path(frame), root / "photos" / name)
-    return root / "photos"
+def photos(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first photos of the city."""
+    root = tmp_path_factory.mktemp("photos")
+    for name, frame in zip(ALL, truth.frames, strict=False):
+        shutil.copyfile(truth.image_path(frame), root / name)
+    return root
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +162,9 @@ def test_a_run_that_was_killed_goes_on(
     assert work.content() == complete.content()
 
 
-@pytest.mark.parametrize("before", [ALL[1:], [*ALL[:3], *ALL[4:]]])
+@pytest.mark.parametrize(
+    "before", [pytest.param(ALL[1:], marks=pytest.mark.slow), [*ALL[:3], *ALL[4:]]]
+)
 def test_other_photos_are_begun_anew(before: list[str], complete: Work, tmp_path: Path) -> None:
     work = Work(tmp_path / "work", complete.photos)
     work.run(before)
@@ -206,7 +201,7 @@ def test_nothing_of_another_version_is_kept(
 
 def test_photos_whose_mask_changes_get_new_features(work: Work) -> None:
     for covered in (60, 120):
-        mask = np.full((240, 320), 255, np.uint8)
+        mask = np.full((300, 400), 255, np.uint8)
         mask[:covered] = 0
         place = work.photos.parent / "masks" / f"{ALL[2]}.png"
         place.parent.mkdir(exist_ok=True)
