@@ -330,7 +330,7 @@ def test_of_another_period_a_view_takes_the_exposure_alone() -> None:
     assert not np.array_equal(split.rgb, plain.rgb)
 
 
-@pytest.mark.parametrize("missing", [0, 1])
+@pytest.mark.parametrize("missing", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_period_without_photos_shows_the_nearest_before_it_or_the_first(missing: int) -> None:
     """A whole period may be held out: `chronoscene split --strategy periods`."""
     data, known = stage(2), [period for period in range(3) if period != missing]

@@ -129,9 +129,10 @@ def test_in_a_log_a_long_step_is_told_twice_a_minute(
         ("validate {scene} --decode", ["check {scene}", "decode images: 0 of 4"]),
         ("validate {scene} --fix {out}", ["correct {scene}", "check {out}"]),
         ("stats {scene}", ["measure scenes"]),
-        (
+        pytest.param(
             "synth {out} --preset tiny --views 4 --size 32x24",
             ["city", "photos: 2 of 12", "points: 9 of 12", "ground truth: 10 of 12"],
+            marks=pytest.mark.slow,
         ),
     ],
 )

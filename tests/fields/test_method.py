@@ -301,7 +301,7 @@ def test_uncertainty_of_one_leaves_the_squared_error() -> None:
     assert float(method.loss(drawn, rays, 0.0)) == pytest.approx(float(error / 2 + 3), rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["nerf-w-t", "neusc"])
+@pytest.mark.parametrize("name", ["nerf-w-t", pytest.param("neusc", marks=pytest.mark.slow)])
 def test_light_is_fitted_to_known_pixels(name: str) -> None:
     """They get the light of their photo, whatever that of its period is."""
     data = make_training_set(3)

@@ -8,7 +8,9 @@ from chronoscene.methods import load_spec, method_names
 
 CHEAP = [e for e in extreme_trainings.EXTREMES[1:] if e.cheap]
 
-SLOW = {n for n in method_names() if load_spec(n).mixes_views} | {"gs-w"}
+SLOW = {n for n in method_names() if load_spec(n).mixes_views}
+SLOW |= {"gs-w", "3dgs-period", "scaffold-gs"}
+"""The last two have the code of others."""
 
 SHARE = 9
 """Pairs of extreme and method of which one is tested by default: each method that is not slow

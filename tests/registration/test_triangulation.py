@@ -107,6 +107,7 @@ def test_poses_of_other_photos_are_refused(bare: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_photos_that_were_corrected_are_looked_at_again(bare: Path, tmp_path: Path) -> None:
     folder, out = tmp_path / "scene", tmp_path / "out"
     scene = read_scene(bare)

@@ -134,7 +134,10 @@ def test_labels_of_plots_do_not_overlap_on_a_phone(browser, make_page, tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium on this machine")
-@pytest.mark.parametrize(("scheme", "ground"), [(1, "rgb(246, 247, 248)"), (0, "rgb(20, 23, 26)")])
+@pytest.mark.parametrize(
+    ("scheme", "ground"),
+    [pytest.param(1, "rgb(246, 247, 248)", marks=pytest.mark.slow), (0, "rgb(20, 23, 26)")],
+)
 def test_the_page_on_a_phone(make_page, tmp_path, scheme, ground):
     """Sliders work, nothing is wider than the window, light and dark."""
     page = make_page(labels=("unbroken" * 20, "1"))

@@ -128,7 +128,7 @@ def test_poses_that_were_spoiled_are_taken_out(
     assert all(name in remarks[0] for name in names)
 
 
-@pytest.mark.parametrize("gps", [False, True])
+@pytest.mark.parametrize("gps", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_part_of_another_size_is_found_and_placed_again(
     tmp_path: Path, write_database: Callable[..., Any], gps: bool
 ) -> None:

@@ -97,7 +97,10 @@ def test_a_full_model_of_the_lens_gives_focal_length_and_height(
     assert any("all coefficients of the lens" in r for r in result["remarks"])
 
 
-@pytest.mark.parametrize(("lens", "gains"), [(LENS, True), ((-0.05, 0.0, 0.0, 0.0), False)])
+@pytest.mark.parametrize(
+    ("lens", "gains"),
+    [(LENS, True), pytest.param((-0.05, 0.0, 0.0, 0.0), False, marks=pytest.mark.slow)],
+)
 def test_part_of_the_points_shows_whether_a_full_model_gains_anything(
     tmp_path: Path,
     write_database: Callable[..., Any],

@@ -121,7 +121,7 @@ def test_nothing_to_map_is_said(make_case: Callable[..., Any]) -> None:
         case.run(separate)
 
 
-@pytest.mark.parametrize("keep_unplaced", [False, True])
+@pytest.mark.parametrize("keep_unplaced", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_photo_that_only_the_other_period_matches_is_registered(
     make_case: Callable[..., Any], keep_unplaced: bool
 ) -> None:
