@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Mask
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.records import (
     Failure,
@@ -159,6 +159,8 @@ the ends of the interval to mean anything: these are empty.
 
 
 DIFFERENCE = ("difference", "difference_low", "difference_high", "by_seeds")
+_COMPARED = ("mean", "sd", "n", "column", "views", "resampled")
+"""Columns that comparisons read."""
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
@@ -294,18 +296,24 @@ def compared(entries: DataFrame) -> DataFrame:
     """
     freedom = [*map(_freedom, entries.column, entries.views)]
     low, high = interval(np.reshape([*entries.resampled], (-1, REPLICATES)), freedom)
-    entries = entries.assign(low=low, high=high, tied=False, rank=0)
-    entries[[*DIFFERENCE]] = math.nan
-    measured = entries[entries.quantity.isin(all_metrics()) & (entries.source == MEASURED)]
-    measured = measured[~measured.column.isin(TRANSFERS)]
-    for (_, quantity, _), part in measured.groupby(["scene", "quantity", "column"], sort=False):
-        ascending = not metric_info(str(quantity)).higher_is_better
-        ranks = part.number.astype(float).rank(method="min", ascending=ascending)
-        entries.loc[ranks.index[ranks <= min(MARKED, len(part) - 1)], "rank"] = ranks.astype(int)
-        best, *others = part.sort_values("mean", ascending=ascending, kind="stable").index
-        if others:
-            compare_with(entries, best, others, chosen=True)
-    return entries
+    tied, rank = np.zeros(len(entries), bool), np.zeros(len(entries), int)
+    differences = np.full((len(entries), len(DIFFERENCE)), math.nan)
+    values = {name: entries[name].to_numpy() for name in _COMPARED}
+    numbers = entries.number.to_numpy(float)
+    measured = entries.quantity.isin(all_metrics()) & (entries.source == MEASURED)
+    places = np.flatnonzero(measured & ~entries.column.isin(TRANSFERS))
+    keys = entries.iloc[places].groupby(["scene", "quantity", "column"], sort=False)
+    for (_, quantity, _), part in keys.indices.items():
+        rows, sign = places[part], 1 if metric_info(str(quantity)).higher_is_better else -1
+        shown = sign * numbers[rows]
+        ranks = 1 + (shown > shown[:, None]).sum(axis=1)
+        rank[rows] = np.where(ranks <= min(MARKED, len(rows) - 1), ranks, 0)
+        rows = rows[np.argsort(-sign * values["mean"][rows], kind="stable")]
+        if len(rows) > 1:
+            family = {name: value[rows] for name, value in values.items()}
+            tied[rows[1:]], differences[rows[1:]] = _comparison(family, chosen=True)
+    columns = dict(zip(DIFFERENCE, differences.T, strict=True))
+    return entries.assign(low=low, high=high, tied=tied, rank=rank, **columns)
 
 
 def compare_with(
@@ -316,33 +324,44 @@ def compare_with(
     ``chosen``: The reference is the best of all of them, not one that was named beforehand. Entries
     with other views are not paired with it: they have no interval, and seeds alone may tie them.
     """
-    first, rest = entries.loc[reference], entries.loc[others]
-    difference = (rest["mean"] - first["mean"]).to_numpy()
-    resampled = np.stack([first.resampled, *rest.resampled])
-    known = np.array([views == first.views for views in rest.views])
+    family = entries.loc[[reference, *others], [*_COMPARED]]
+    tied, differences = _comparison({n: family[n].to_numpy() for n in _COMPARED}, chosen=chosen)
+    entries.loc[others, "tied"] = tied
+    entries.loc[others, [*DIFFERENCE]] = differences
+
+
+def _comparison(family: Mapping[str, Any], *, chosen: bool) -> tuple[Mask, Array]:
+    """Compare all but the first of some entries with that one; see `compare_with`.
+
+    Returns:
+        tied: True where the difference may be chance. [N - 1]
+        differences: The columns `DIFFERENCE`. [N - 1, 4]
+    """
+    means, ns, views = (family[name] for name in ("mean", "n", "views"))
+    difference = means[1:] - means[0]
+    resampled = np.stack([*family["resampled"]])
+    known = np.array([other == views[0] for other in views[1:]])
     known &= np.isfinite(resampled[1:, 0]) & np.isfinite(resampled[0, 0])
-    ns = np.array([first.n, *rest.n])
-    spread = seed_spread([first.sd, *rest.sd], ns)
+    spread = seed_spread(family["sd"], ns)
     by_seeds = explained_by_seeds(spread, ns)
-    margin = np.full(len(rest), math.nan)
-    freedom = _freedom(first.column, first.views)
+    margin = np.full(len(difference), math.nan)
+    freedom = _freedom(family["column"][0], views[0])
     if known.any():
-        family = np.append(True, known)
+        paired = np.append(True, known)
         margin[known] = margins(
-            np.array([first["mean"], *rest["mean"]])[family],
-            resampled[family],
+            means[paired],
+            resampled[paired],
             freedom,
-            SeedSpread(spread.variances[family], spread.freedom),
-            ns[family],
+            SeedSpread(spread.variances[paired], spread.freedom),
+            ns[paired],
             chosen=chosen,
         )
-    entries.loc[others, "tied"] = np.abs(difference) <= np.where(known, margin, by_seeds)
+    tied = np.abs(difference) <= np.where(known, margin, by_seeds)
     # Up to 2, a t-distribution has no finite variance, and tens of dB would say nothing.
     if round(freedom, 6) <= 2:
         margin[:] = math.nan
-    entries.loc[others, [*DIFFERENCE]] = np.stack(
-        [difference, difference - margin, difference + margin, by_seeds], axis=1
-    )
+    columns = [difference, difference - margin, difference + margin, by_seeds]
+    return tied, np.stack(columns, axis=1)
 
 
 @lru_cache

@@ -276,7 +276,7 @@ def _overviews(entries: DataFrame, names: Sequence[str], *, size: bool) -> Itera
             columns.append(_Column((first, head) if several else head, found, "number"))
     last, part = parts[-1]
     if size and (last == ALL_SCENES or not several):  # else of one test of several
-        columns.append(_Column(COST_TITLES[SIZE], part.query("quantity == @SIZE"), "number"))
+        columns.append(_Column(COST_TITLES[SIZE], part[part.quantity == SIZE], "number"))
     step = MAX_SCENES * len(names)
     starts = range(0, len(parts) * len(names), step)
     for start in starts:
