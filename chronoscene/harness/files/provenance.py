@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -104,13 +105,18 @@ def method_version(name: str) -> str:
 
 def library_versions() -> dict[str, str]:
     """Return the versions of the libraries that numbers may depend on."""
-    versions = {"python": platform.python_version()}
-    for name in ("numpy", "numba", "torch", "gsplat", "opencv-contrib-python-headless", "pillow"):
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return versions
+    names = ("numpy", "numba", "torch", "gsplat", "opencv-contrib-python-headless", "pillow")
+    installed = {name: found for name in names if (found := _installed_version(name)) is not None}
+    return {"python": platform.python_version(), **installed}
+
+
+@cache
+def _installed_version(name: str) -> str | None:
+    """Return the version of a package; it is in a file that takes milliseconds to parse."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 def describe_device(kind: str, threads: int) -> str:

@@ -400,8 +400,9 @@ def execute(document: dict[str, Any], report: Report) -> None:
     """Run the job in ``document``; every failure ends in ``failed.json``."""
     job = replace(Job.from_document(document), commit=code_version())
     staging = Path(job.staging)
-    if job.origin.plugin_path is not None:
-        sys.path.append(job.origin.plugin_path)
+    place = job.origin.plugin_path
+    if place is not None and place not in sys.path:
+        sys.path.append(place)
     try:
         with needing_space(job.folder):
             run_job(job, report if job.reports else None)

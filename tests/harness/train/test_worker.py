@@ -2,7 +2,9 @@
 
 import os
 import shutil
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +21,12 @@ from chronoscene.methods import load_spec, method_names
 from chronoscene.training import photometric
 from chronoscene.training.checkpoint import load_tensors
 
-SPLATS = [name for name in method_names() if not load_spec(name).mixes_views]
-"""Methods that draw one view in a step."""
+SPLATS = [
+    pytest.param(name, marks=pytest.mark.slow if name in ("3dgs-period", "scaffold-gs") else ())
+    for name in method_names()
+    if not load_spec(name).mixes_views
+]
+"""Methods that draw one view in a step; two have the code of others, ``3dgs`` for example."""
 
 
 @pytest.mark.parametrize("method", SPLATS)
@@ -59,6 +65,13 @@ def test_every_method_learns_one_period_after_the_other(bench_here, method):
     assert record.checkpoint_bytes == sizes[1]
     periods = [load_tensors(model)[1]["num_periods"] for model in models]
     assert periods == ([1, 1] if load_spec(method).period_input == "none" else [1, 2])
+
+
+def test_the_place_of_a_plug_in_is_added_to_the_module_path_once(bench_here):
+    bench_here("MEAN", iterations=2)
+    before = [*sys.path]
+    bench_here("MEAN", seeds=(1,), iterations=2)
+    assert str(Path.cwd()) in before and sys.path == before
 
 
 def test_no_stage_looks_at_later_photos(scene_folder, tmp_path, bench_here):
