@@ -18,7 +18,7 @@ from chronoscene.methods import build_config, import_object, load_spec, method_n
 
 from .small_fields import SMALL_FIELD
 
-STEPS = 24
+STEPS = 16  # each photo once
 FIELD_STEPS = 6
 NEEDS_MORE = {"densification=mcmc", "fusion=sum"}
 """Choices that are refused without another option, whose name the message has."""
