@@ -35,6 +35,7 @@ from chronoscene.training.optimizers.summing import Part
 from chronoscene.training.schedules import learning_rates
 from chronoscene.training.sparse_depth import DepthTarget, SparseDepth
 from chronoscene.training.views import (
+    PhotoSizes,
     PhotosOnDevice,
     ViewSampler,
     count_views,
@@ -117,9 +118,15 @@ class AnchorTrainer:
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed, train.expect)
-        self.photos = PhotosOnDevice(train, model.device)
-        self.sparse_depth = SparseDepth(self.config.depth_weight, train, model.device)
+        self.sizes = PhotoSizes(train, self.config.half_size_share)
+        self._use(train)
         self.exposure = Exposure(self.config.exposure, train, model.device, Pace(self.views))
+
+    def _use(self, train: TrainingSet) -> None:
+        """Learn from the same photos in other sizes from now on."""
+        self.train = train
+        self.photos = PhotosOnDevice(train, self.model.device)
+        self.sparse_depth = SparseDepth(self.config.depth_weight, train, self.model.device)
 
     def step(self, index: int, progress: float) -> StepReport:
         """Render training views, learn from them, and grow and prune where a round is due.
@@ -129,6 +136,8 @@ class AnchorTrainer:
         one view to a step, a round drops its gradients of anchors, as the official code does; with
         several, which would cost so many views, the anchors move before the round.
         """
+        if (train := self.sizes.at(progress)) is not self.train:
+            self._use(train)
         count = views_of_step(self.views, index, progress)
         done = self._progress_after(index, count, progress)
         due = [self._draw(progress) for _ in range(count)]

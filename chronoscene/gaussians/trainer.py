@@ -35,6 +35,7 @@ from chronoscene.training.photometric import photometric_loss
 from chronoscene.training.schedules import cooled, log_linear
 from chronoscene.training.sparse_depth import SparseDepth
 from chronoscene.training.views import (
+    PhotoSizes,
     PhotosOnDevice,
     ViewSampler,
     count_views,
@@ -138,11 +139,18 @@ class GaussianTrainer:
 
     def begin_views(self) -> None:
         """Begin with the views of the training set, and without exposures."""
-        device = self.background.device
         self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
-        self.photos = PhotosOnDevice(self.train, device)
-        self.sparse_depth = SparseDepth(self.config.depth_weight, self.train, device)
+        device = self.background.device
         self.exposure = Exposure(self.config.exposure, self.train, device, self.pace)
+        self.sizes = PhotoSizes(self.train, self.config.half_size_share)
+        self._use(self.train)
+
+    def _use(self, train: TrainingSet) -> None:
+        """Learn from the same photos in other sizes from now on."""
+        device = self.background.device
+        self.train = train
+        self.photos = PhotosOnDevice(train, device)
+        self.sparse_depth = SparseDepth(self.config.depth_weight, train, device)
 
     def begin(self) -> None:
         """Forget the moments of the optimiser and the gradients seen for densification."""
@@ -157,6 +165,8 @@ class GaussianTrainer:
         their gradients are added. With one view to a step, densification drops its gradients, as
         the released code does; with several, which would cost so many views, it comes after Adam.
         """
+        if (train := self.sizes.at(progress)) is not self.train:
+            self._use(train)
         count = views_of_step(self.views, index - self.timeline.begin, progress)
         due = self.timeline.at(index, progress, count)
         # Higher than what is due at the start of a training that goes on with a model.

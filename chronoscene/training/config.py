@@ -54,6 +54,9 @@ class SplattingConfig:
     cooldown: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the training, its last, in which all learning rates of the model fall further, to a
     tenth of what they would be: the model settles. Not in the papers."""
+    half_size_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the training, its first, in which photos of 400,000 pixels or more are drawn at half
+    of their width and height: faster, and less is learned by heart."""
     exposure: ExposureKind = "none"
     """``image`` | ``period``: learn an affine transform of the colours for each training image, or
     for each period. A rendered view has that of its period: `chronoscene.training.exposure`."""

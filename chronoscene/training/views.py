@@ -14,7 +14,7 @@ from torch import Tensor
 
 from chronoscene.kernels.runtime import views_for_threads
 from chronoscene.kernels.thread_pool import num_workers
-from chronoscene.methods import TrainingSet, View
+from chronoscene.methods import SparseDepths, TrainingSet, View
 from chronoscene.methods.interface import nothing_ahead
 from chronoscene.training.devices import to_device
 
@@ -25,6 +25,10 @@ SHARE_OF_GPU = 0.25
 
 COARSE_PIXELS = 320 * 240
 """Pixels of a view in which weights of Gaussians are measured, at least, if it has as many."""
+
+HALVED_PIXELS = 400_000
+"""Pixels of a photo from which `half_size_share` applies. Below, the time of a step depends on the
+Gaussians more than on the pixels, and half a photo shows too little of them."""
 
 AHEAD = 32
 """Number of draws that are known before they are made."""
@@ -107,6 +111,69 @@ class PhotosOnDevice:
             self._kept[kind, number] = tensor
             self._room -= tensor.nbytes
         return tensor
+
+
+class PhotoSizes:
+    """Training set whose large photos are half as wide and high for the first share of a training.
+
+    Args:
+        train: The set with photos as they are.
+        share: Option `half_size_share`.
+    """
+
+    def __init__(self, train: TrainingSet, share: float) -> None:
+        self._train, self._share = train, share
+        self._halved = with_halved_photos(train) if share else train
+
+    def at(self, progress: float) -> TrainingSet:
+        """Return the set to learn from after a share of the training."""
+        return self._halved if progress < self._share else self._train
+
+
+def with_halved_photos(train: TrainingSet) -> TrainingSet:
+    """Return the set with photos of `HALVED_PIXELS` at half of their width and height.
+
+    A pixel counts where all four do, and has the depth of the nearest of their points.
+    """
+    factors = [2 if v.width * v.height >= HALVED_PIXELS else 1 for v in train.views]
+    if 2 not in factors:
+        return train
+
+    def load_image(i: int) -> NDArray[np.uint8]:
+        image = train.load_image(i)
+        return image if factors[i] == 1 else downscale_image(image, factors[i])
+
+    def load_mask(i: int) -> NDArray[np.bool_] | None:
+        mask = train.load_mask(i)
+        return mask if mask is None or factors[i] == 1 else _halved_mask(mask)
+
+    def load_depths(i: int) -> SparseDepths:
+        depths = train.load_depths(i)
+        return depths if factors[i] == 1 else _halved_depths(depths, train.views[i])
+
+    views = tuple(
+        view if factor == 1 else downscale_view(view, factor)
+        for view, factor in zip(train.views, factors, strict=True)
+    )
+    return replace(
+        train, views=views, load_image=load_image, load_mask=load_mask, load_depths=load_depths
+    )
+
+
+def _halved_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    height, width = (size // 2 * 2 for size in mask.shape)
+    rows = mask[0:height:2, :width] & mask[1:height:2, :width]
+    return rows[:, 0::2] & rows[:, 1::2]
+
+
+def _halved_depths(depths: SparseDepths, view: View) -> SparseDepths:
+    rows, columns = np.divmod(depths.pixels, view.width)
+    rows, columns = rows // 2, columns // 2
+    inside = (rows < view.height // 2) & (columns < view.width // 2)
+    pixels, found = (rows * (view.width // 2) + columns)[inside], depths.depths[inside]
+    order = np.lexsort((found, pixels))
+    pixels, first = np.unique(pixels[order], return_index=True)
+    return SparseDepths(pixels, found[order][first])
 
 
 def count_views(option: int | Literal["auto"]) -> int:

@@ -1,6 +1,7 @@
 """Options that methods share: each does what it says, and a training with it can be resumed."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from chronoscene.harness.train import painted_balls
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object, load_spec
 from chronoscene.methods.interface import no_depths
-from chronoscene.training import sparse_depth
+from chronoscene.training import sparse_depth, views
 from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.views import downscale_view
 
@@ -147,6 +148,28 @@ def test_surfaces_are_held_to_the_sparse_points(name, monkeypatch):
         ratios = [d.flat[k.pixels] / k.depths for d, k in zip(rendered, known, strict=True)]
         deviations.append(float(np.mean(np.abs(np.concatenate(ratios) - 1))))
     assert deviations[1] < 0.95 * deviations[0]
+
+
+@pytest.mark.parametrize("name", ["3dgs", "scaffold-gs", "chronogs", *GAUSSIANS])
+def test_large_photos_are_drawn_at_half_their_size_at_first(name, monkeypatch, tmp_path):
+    monkeypatch.setattr(views, "HALVED_PIXELS", 1)
+    data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))
+    method, widths = start(name, data, half_size_share=0.5, iterations=8), []
+    for index in range(8):
+        assert not method.step(index, index / 8).skipped
+        widths.append(method.trainer.train.views[0].width)
+        if index == 2:
+            (tmp_path / "training").mkdir()
+            method.save_training(tmp_path / "training")
+    bounds = getattr(method.trainer, "bounds", [0.0, 1.0])  # cl-splats: of its dates
+    middles = [(a, (a + b) / 2) for a, b in pairwise(bounds)]
+    small = [any(a <= index / 8 < middle for a, middle in middles) for index in range(8)]
+    assert widths == [painted_balls.WIDTH // (1 + half) for half in small]
+    resumed = start(name, data, half_size_share=0.5, iterations=8)
+    resumed.load_training(tmp_path / "training")
+    for index in range(3, 8):
+        resumed.step(index, index / 8)
+    assert saved(resumed, tmp_path / "resumed") == saved(method, tmp_path / "whole")
 
 
 @pytest.mark.parametrize("name", ["3dgs", *GAUSSIANS])

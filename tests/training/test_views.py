@@ -1,20 +1,25 @@
 """Order of the views, and sizes of their photos."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.methods import TrainingView
+from chronoscene.harness.train import painted_balls
+from chronoscene.methods import SparseDepths, TrainingView
 from chronoscene.training import views
 from chronoscene.training.views import (
     AHEAD,
+    PhotoSizes,
     PhotosOnDevice,
     ViewSampler,
     coarse_view,
     downscale_image,
     downscale_view,
+    with_halved_photos,
 )
 
 
@@ -112,6 +117,41 @@ def test_a_point_lands_at_the_same_place() -> None:
     point = np.linalg.inv(original.K) @ [5.0, 3.0, 1.0]  # corner of pixels (4, 2) and (5, 3)
     np.testing.assert_allclose(small.K @ point, [2.5, 1.5, 1.0])
     np.testing.assert_array_equal(original.K[0], [50.0, 0.0, 4.0])
+
+
+def test_large_photos_are_halved_with_their_masks_and_depths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(views, "HALVED_PIXELS", 7 * 5)
+    rng = np.random.default_rng(0)
+    photos = [rng.integers(0, 256, (h, w, 3)).astype(np.uint8) for h, w in ((5, 7), (4, 6))]
+    mask = np.ones((5, 7), bool)
+    mask[1, 2] = mask[4, 0] = False  # the last row and column fill no pixel
+    depths = SparseDepths(
+        np.array([0, 8, 9, 6, 34]), np.array([5.0, 4.0, 3.0, 2.0, 1.0], np.float32)
+    )
+    whole = replace(
+        painted_balls.make_training_set(1),
+        views=(view(7, 5), view(6, 4)),
+        load_image=lambda i: photos[i],
+        load_mask=lambda i: None if i else mask,
+        load_depths=lambda i: depths,
+    )
+    small = with_halved_photos(whole)
+    assert [(v.width, v.height) for v in small.views] == [(3, 2), (6, 4)]
+    np.testing.assert_array_equal(small.load_image(0), downscale_image(photos[0], 2))
+    np.testing.assert_array_equal(small.load_mask(0), [[True, False, True], [True, True, True]])
+    found = small.load_depths(0)
+    np.testing.assert_array_equal(found.pixels, [0, 1])
+    np.testing.assert_array_equal(found.depths, [4.0, 3.0])
+    assert small.load_image(1) is photos[1] and small.load_mask(1) is None
+    assert small.load_depths(1) is depths and small.views[1] is whole.views[1]
+
+    sizes = PhotoSizes(whole, 0.25)
+    assert [sizes.at(p).views[0].width for p in (0.0, 0.24, 0.25, 1.0)] == [3, 3, 7, 7]
+    assert PhotoSizes(whole, 0.0).at(0.0) is whole
+    monkeypatch.setattr(views, "HALVED_PIXELS", 7 * 5 + 1)
+    assert with_halved_photos(whole) is whole
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,13 @@ from chronoscene.methods import (
 )
 from chronoscene.methods.preset_files import find_preset
 
-_NEUTRAL = {"depth_weight": 0.0, "opacity_dropout": 0.0, "period_decay": 0.0, "views_per_step": 1}
+_NEUTRAL = {
+    "depth_weight": 0.0,
+    "half_size_share": 0.0,
+    "opacity_dropout": 0.0,
+    "period_decay": 0.0,
+    "views_per_step": 1,
+}
 
 
 @dataclass(frozen=True, slots=True)
