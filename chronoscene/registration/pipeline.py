@@ -16,6 +16,7 @@ from chronoscene.formats import chronoscene as our_format
 from chronoscene.geodesy import ReferenceSystem, read_projected
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.wording import printable
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.control.route import check_options, resect_photos
@@ -116,13 +117,12 @@ def run(
             page=options.page,
             ties=ties,
             tie_points=points,
-            title=f"Registration of {out.resolve().name}",
+            title=f"Registration of {printable(out.resolve().name)}",
         )
         for name, judged in (("alignment", found.verdict), ("absolute position", found.position)):
             context.stages.remark(name, f"{judged.level}: {judged.text}")
         write_coordinates(staged, scene, registered.georeference, crs)
-        log = json.dumps(_log(registered, inputs, context), indent=1, ensure_ascii=False)
-        write_text_atomic(staged / output.LOG, log + "\n")
+        write_text_atomic(staged / output.LOG, log_text(_log(registered, inputs, context)))
         output.check_free(out, overwrite=options.overwrite)
         output.publish(staged, out)
     if inspected is not None:
@@ -188,3 +188,9 @@ def _log(registered: Registered, inputs: PhotoInputs, context: Context) -> dict[
         ],
         "stages": context.stages.log,
     }
+
+
+def log_text(log: Mapping[str, Any]) -> str:
+    """JSON of a log; bytes in names of folders that are not UTF-8 are escaped."""
+    text = json.dumps(log, indent=1, ensure_ascii=False) + "\n"
+    return text.encode("utf-8", "backslashreplace").decode()

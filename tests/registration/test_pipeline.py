@@ -1,6 +1,7 @@
 """The whole command on small generated photos of two dates."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.registration.context import Options
 from chronoscene.registration.photos.captures import read_captures
-from chronoscene.registration.pipeline import run
+from chronoscene.registration.pipeline import log_text, run
 from chronoscene.registration.quality.rays import cross_matches
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
@@ -202,6 +203,12 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
     assert again.endswith("are they the same photo?")
     assert f"note: {again}\n" in summary(registered, out, None)
     assert not [f for f in validate_scene(out).findings if f.severity == "error"]
+
+
+def test_names_of_folders_that_are_not_utf_8() -> None:
+    log = {"work": os.fsdecode(b"/tmp/\xff.work"), "label": "été"}
+    text = log_text(log)
+    assert json.loads(text.encode()) == log and "été" in text
 
 
 def started(arguments: list[str]) -> subprocess.Popen[str]:
