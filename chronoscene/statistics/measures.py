@@ -164,8 +164,8 @@ def period_coverage(xyz: Array, seen: Mask) -> list[float | None]:
     if not inside.any():
         low, high, inside = xyz.min(axis=0), xyz.max(axis=0), np.ones(len(xyz), bool)
     edge = float((high - low).max()) / CELLS or 1.0
-    cell = ((xyz[inside] - low) / edge).astype(np.int64)
-    flat = (cell[:, 0] * (CELLS + 1) + cell[:, 1]) * (CELLS + 1) + cell[:, 2]
+    cell = np.minimum((xyz[inside] - low) / edge, CELLS - 1).astype(np.int64)
+    flat = (cell[:, 0] * CELLS + cell[:, 1]) * CELLS + cell[:, 2]
     total = int(np.count_nonzero(np.bincount(flat)))
     covered = [int(np.count_nonzero(np.bincount(flat[column]))) for column in seen[inside].T]
     return [n / total for n in covered]

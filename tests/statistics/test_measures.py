@@ -144,6 +144,14 @@ def test_coverage_is_that_of_the_cubes(scale: float) -> None:
     assert shares[2] == 1.0
 
 
+def test_points_at_the_far_end_fill_no_cube_of_their_own() -> None:
+    xyz = np.zeros((1000, 3))
+    xyz[:, 0] = np.repeat(np.linspace(0, 1, 101), 10)[:1000]
+    xyz[-10:, 0] = 1.0
+    last = xyz[:, 0] == 1.0
+    assert period_coverage(xyz, np.column_stack([last, ~last])) == [0.02, 1.0]
+
+
 @pytest.mark.parametrize("outliers", [20, 600])
 def test_outliers_do_not_change_coverage(outliers: int) -> None:
     rng = np.random.default_rng(0)
