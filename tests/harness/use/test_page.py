@@ -364,6 +364,11 @@ def test_many_periods_and_long_names_on_a_phone(trained, tmp_path, browser):
     page = browser.new_page(viewport={"width": 390, "height": 844})
     page.goto(index.as_uri())
     page.evaluate("viewer.ready")
+    for width in (320, 390):
+        page.set_viewport_size({"width": width, "height": 844})
+        box = page.locator("#open-help").bounding_box()
+        assert box["x"] + box["width"] <= width - 6
+    assert page.locator("#modes button").all_text_contents() == ["Periods", "Wipe", "Blink"]
     page.keyboard.press("]")
     page.wait_for_timeout(200)
     assert page.locator("#ticks button:visible").all_text_contents() == names[:1]
