@@ -36,7 +36,7 @@ from chronoscene.io.log import Log
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import sha256_of, staged_folder
 from chronoscene.registration.context import Options as Registration
-from chronoscene.registration.output import CERTIFICATE, PAGE, Inspection
+from chronoscene.registration.output import CERTIFICATE, LOG, PAGE, Inspection
 from chronoscene.registration.photos.captures import find_captures, read_captures
 from chronoscene.registration.pipeline import run as register
 from chronoscene.registration.work_folder import fingerprint
@@ -139,16 +139,27 @@ def _register(project: Project) -> Sequence[Path]:
     with project.progress(f"read {project.captures}") as report:
         folder, table = find_captures(project.captures, project.table)
         captures = read_captures(folder, table=table)
-        options = Registration(page=True, overwrite=True)
+        options = Registration(page=True, overwrite=True, **_control(scene))
         register(captures, scene, options, report=report, inspected=judged.append)
     for line in (*captures.notes, *judged[0].summary.splitlines()):
         project.say(line)
     return [scene / PAGE, scene / CERTIFICATE, scene / "sparse/0/images.bin"]
 
 
+def _control(scene: Path) -> dict[str, Any]:
+    """Options for the tie points and ground control of the scene there is, which stay in use."""
+    if not (scene / LOG).is_file():
+        return {}
+    given = read_json_document(scene / LOG)["options"]
+    if "tie_points" not in given:
+        return {}
+    also = {name: given[name] for name in ("tie_scale", "crs") if given.get(name, 1.0) != 1.0}
+    return {"tie_points": Path(given["tie_points"]), **also}
+
+
 def _register_command(project: Project, **options: str) -> str:
     words = "register", project.captures, project.scene, "--overwrite", "--report"
-    return project.command(*words, table=project.table, **options)
+    return project.command(*words, table=project.table, **_control(project.scene) | options)
 
 
 def _validate(project: Project) -> Sequence[Path]:
