@@ -21,6 +21,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
+from chronoscene.formats.shared.grouping import natural_key
 from chronoscene.geodesy import Georeference, ReferenceSystem, read_reference_system
 from chronoscene.io.documents import filled_lines, read_text
 from chronoscene.scene.splits import composed
@@ -222,7 +223,7 @@ def _assemble(path: Path, rows: Iterable[_Row], crs: ReferenceSystem | None) -> 
             roles.get(name, "control" if name in worlds else "tie"),
             sigmas.get(name),
         )
-        for name, mine in sorted(clicks.items())
+        for name, mine in sorted(clicks.items(), key=lambda item: natural_key(item[0]))
     )
     if not points:
         raise SceneError(path, expected="tie points", found="no clicks", todo=_TODO_CSV)

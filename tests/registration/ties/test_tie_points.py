@@ -84,6 +84,11 @@ def test_csv_with_and_without_a_header(tmp_path: Path) -> None:
         assert found.crs is None
 
 
+def test_points_are_in_natural_order(tmp_path: Path) -> None:
+    text = "point,image,x,y\n" + "".join(f"GCP {n},a.jpg,{n},5\n" for n in (10, 2, 1))
+    assert [point.name for point in read(tmp_path, text).points] == ["GCP 1", "GCP 2", "GCP 10"]
+
+
 def test_a_point_without_a_click_may_come_first(tmp_path: Path) -> None:
     found = read(tmp_path, "g0,,,,100,200,50\ng1,a.jpg,1,2,110,200,50\n").points
     assert [(p.name, len(p.clicks), p.role) for p in found] == [
