@@ -21,11 +21,12 @@ def test_all_steps_are_run_once(fake):
     said = fake.go()
     assert fake.calls == NAMES
     assert fake.states == dict.fromkeys(MADE, "done") | {"survey": "skipped"}
-    assert said[0] == "" and "[1/6] register: done in 0:00" in said
+    lines = "\n".join(said)
+    assert said[0] == "" and "[1/6] register: done in " in lines
     assert "[6/6] survey: skipped, the scene has no scale" in said
     said = fake.go()
     assert fake.calls == ["survey"]  # it may have become possible
-    assert "[3/6] bench: kept, made in 0:00" in said
+    assert "[3/6] bench: kept, made in " in "\n".join(said)
 
 
 @pytest.mark.parametrize("step", MADE)
