@@ -16,7 +16,7 @@ from chronoscene.errors import ProgramError
 from chronoscene.io.processes import Outcome, end_processes, process_tree, stoppable
 from chronoscene.io.wording import printable
 
-END_OF_LOG = 300  # Characters that an error repeats
+END_OF_LOG, START_OF_COMMAND = 300, 80  # Characters that an error repeats
 FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0
 """Seconds between two looks at the memory: to measure a large process takes some milliseconds."""
 
@@ -57,7 +57,7 @@ def run_program(command: Sequence[str], *, folder: Path, log: Path) -> Usage:
             )
         except OSError as error:
             raise ProgramError(
-                shlex.join(command)[:80],
+                _named(command),
                 expected="a program that can be started",
                 found=error.strerror or str(error),
                 todo="install it, or name its environment with --set prefix=...; "
@@ -76,13 +76,22 @@ def run_program(command: Sequence[str], *, folder: Path, log: Path) -> Usage:
             process.wait()
     if process.returncode:
         raise ProgramError(
-            shlex.join(command)[:80],
+            _named(command),
             expected="the program to succeed",
             found=f"{Outcome(process.returncode, None).cause}; {log.name} ends with: "
-            + printable(" | ".join(log_lines(log))[-END_OF_LOG:]),
+            + printable(_end_of(" | ".join(log_lines(log)))),
             todo="correct what it says",
         )
     return Usage(seconds, peak or None)
+
+
+def _named(command: Sequence[str]) -> str:
+    text = shlex.join(command)
+    return text if len(text) <= START_OF_COMMAND else f"{text[:START_OF_COMMAND]} ..."
+
+
+def _end_of(text: str) -> str:
+    return text if len(text) <= END_OF_LOG else f"... {text[-END_OF_LOG:]}"
 
 
 def log_lines(log: Path) -> list[str]:

@@ -55,6 +55,12 @@ def test_a_failure_ends_in_the_last_lines_of_the_log(tmp_path):
         run(python("import os; os.abort()"), tmp_path)
 
 
+def test_what_an_error_leaves_out_is_marked(tmp_path):
+    code = f"print('log ' * 200); raise SystemExit(1)  # {'long ' * 40}"
+    with pytest.raises(ProgramError, match=r" \.\.\.: expected .* ends with: \.\.\. .*log log; "):
+        run(python(code), tmp_path)
+
+
 def test_a_program_that_is_not_there(tmp_path):
     with pytest.raises(ProgramError, match=r"no-such-program -x: expected .*No such file"):
         run(["no-such-program", "-x"], tmp_path)
