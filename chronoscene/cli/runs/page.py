@@ -68,7 +68,9 @@ def _text(summary: PageSummary) -> str:
             f"{total:,} Gaussians of {counted(len(packed.periods), 'period')}: {packed.stored:,} "
             f"stored, with {packed.centres:,} centres"
         )
-    sizes = f"Gaussians {summary.gaussians / 1e6:.1f} MB, photos {summary.photos / 1e6:.1f} MB"
+    rest = summary.total - summary.gaussians - summary.photos
+    parts = {"Gaussians": summary.gaussians, "photos": summary.photos, "viewer": rest}
+    sizes = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in parts.items())
     lines.append(f"{summary.total / 1e6:.1f} MB: {sizes}")
     if str(summary.reduction):
         lines.append(f"To keep --max-megabytes, left out: {summary.reduction}")

@@ -235,7 +235,7 @@ def _to_control(
     )
     kept = {name for (_, name), u in zip(known, used, strict=True) if u}
     against = contradictions(names, source, target) if used.all() else []
-    remarks = [f"moved to {len(kept)} control points{note}"]
+    remarks = [f"model moved to {len(kept)} control points{note}"]
     return there, kept, remarks + [CONTRADICTION + c for c in against]
 
 
