@@ -136,7 +136,7 @@ class AnchorTrainer:
         one view to a step, a round drops its gradients of anchors, as the official code does; with
         several, which would cost so many views, the anchors move before the round.
         """
-        if (train := self.sizes.at(progress)) is not self.train:
+        if (train := self.sizes.change(progress)) is not None:
             self._use(train)
         count = views_of_step(self.views, index, progress)
         done = self._progress_after(index, count, progress)

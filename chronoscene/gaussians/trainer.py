@@ -165,7 +165,7 @@ class GaussianTrainer:
         their gradients are added. With one view to a step, densification drops its gradients, as
         the released code does; with several, which would cost so many views, it comes after Adam.
         """
-        if (train := self.sizes.at(progress)) is not self.train:
+        if (train := self.sizes.change(progress)) is not None:
             self._use(train)
         count = views_of_step(self.views, index - self.timeline.begin, progress)
         due = self.timeline.at(index, progress, count)

@@ -114,20 +114,24 @@ class PhotosOnDevice:
 
 
 class PhotoSizes:
-    """Training set whose large photos are half as wide and high for the first share of a training.
+    """Choice of the training set whose large photos are halved for the first share of a training.
 
     Args:
-        train: The set with photos as they are.
+        train: The set with photos as they are, which is in use at first.
         share: Option `half_size_share`.
     """
 
     def __init__(self, train: TrainingSet, share: float) -> None:
-        self._train, self._share = train, share
+        self._train, self._share, self._used = train, share, train
         self._halved = with_halved_photos(train) if share else train
 
-    def at(self, progress: float) -> TrainingSet:
-        """Return the set to learn from after a share of the training."""
-        return self._halved if progress < self._share else self._train
+    def change(self, progress: float) -> TrainingSet | None:
+        """Return the set to learn from after a share of the training; None if it is in use."""
+        due = self._halved if progress < self._share else self._train
+        if due is self._used:
+            return None
+        self._used = due
+        return due
 
 
 def with_halved_photos(train: TrainingSet) -> TrainingSet:

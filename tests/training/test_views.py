@@ -148,8 +148,9 @@ def test_large_photos_are_halved_with_their_masks_and_depths(
     assert small.load_depths(1) is depths and small.views[1] is whole.views[1]
 
     sizes = PhotoSizes(whole, 0.25)
-    assert [sizes.at(p).views[0].width for p in (0.0, 0.24, 0.25, 1.0)] == [3, 3, 7, 7]
-    assert PhotoSizes(whole, 0.0).at(0.0) is whole
+    changes = [sizes.change(progress) for progress in (0.0, 0.24, 0.25, 1.0)]
+    assert [None if c is None else c.views[0].width for c in changes] == [3, None, 7, None]
+    assert changes[2] is whole and PhotoSizes(whole, 0.0).change(0.0) is None
     monkeypatch.setattr(views, "HALVED_PIXELS", 7 * 5 + 1)
     assert with_halved_photos(whole) is whole
 
