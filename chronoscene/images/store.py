@@ -134,6 +134,11 @@ class ImageStore:
         files = [p for f in scene.frames for p in _files(scene, f)] if fixed else []
         self._stamps = {path: _stamp(path) for path in files}
 
+    @property
+    def cached_bytes(self) -> int:
+        """Bytes in the cache."""
+        return self._bytes
+
     def camera(self, frame: Frame) -> Camera:
         """Return the camera of a frame at the evaluation size."""
         return resize_camera(frame.camera, *evaluation_size(*frame.camera.size, self._max_width))

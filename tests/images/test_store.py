@@ -97,7 +97,7 @@ def test_store_gives_the_file(scene):
         with Image.open(scene.image_path(frame)) as image:
             np.testing.assert_array_equal(store.load(frame), np.array(image))
         assert store.camera(frame) is frame.camera
-    assert store._bytes == 6 * IMAGE_BYTES
+    assert store.cached_bytes == 6 * IMAGE_BYTES
     assert store.load_mask(scene.frames[0]) is None
 
 
@@ -111,9 +111,9 @@ def test_masks_are_cached_beside_the_images_at_their_size(scene, tmp_path):
     mask = store.load_mask(masked.frames[0])
     assert mask.shape == (24, 32) and not mask[:14].any() and mask[14:].all()
     assert store.load_mask(masked.frames[0]) is mask
-    assert store._bytes == IMAGE_BYTES // 4 + 32 * 24
+    assert store.cached_bytes == IMAGE_BYTES // 4 + 32 * 24
     assert store.load_mask(masked.frames[1]) is None
-    assert store._bytes == IMAGE_BYTES // 4
+    assert store.cached_bytes == IMAGE_BYTES // 4
 
 
 def test_store_and_camera_agree_on_the_size(scene):
@@ -138,7 +138,7 @@ def test_the_cache_drops_what_was_used_longest_ago(scene):
     second = store.load(b)
     assert store.load(a) is first
     store.load(c)
-    assert store._bytes == 2 * IMAGE_BYTES
+    assert store.cached_bytes == 2 * IMAGE_BYTES
     assert store.load(a) is first
     assert store.load(b) is not second
 
@@ -146,7 +146,7 @@ def test_the_cache_drops_what_was_used_longest_ago(scene):
 def test_a_store_without_cache_still_loads(scene):
     store = ImageStore(scene, memory_limit=0)
     assert store.load(scene.frames[0]).shape == (48, 64, 3)
-    assert store._bytes == 0
+    assert store.cached_bytes == 0
 
 
 def test_many_threads(scene):
@@ -162,7 +162,7 @@ def test_many_threads(scene):
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(work, range(8)))
-    assert store._bytes == 3 * IMAGE_BYTES
+    assert store.cached_bytes == 3 * IMAGE_BYTES
 
 
 def test_a_damaged_image_of_a_scene_names_its_file(scene):
@@ -225,7 +225,7 @@ def test_expected_images_are_decoded_in_the_background(scene, decoder):
     store.expect(scene.frames)
     finish(store)
     assert decoder.names == [f"{i}.png" for i in range(1 + AHEAD)]
-    assert decoder.threads == {"decoder"} and store._bytes == (1 + AHEAD) * IMAGE_BYTES
+    assert decoder.threads == {"decoder"} and store.cached_bytes == (1 + AHEAD) * IMAGE_BYTES
     for frame in scene.frames[: 1 + AHEAD]:
         np.testing.assert_array_equal(store.load(frame), load_rgb(scene.image_path(frame)))
     assert store.waited == 0.0 and len(decoder.names) == 1 + AHEAD

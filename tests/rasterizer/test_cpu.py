@@ -63,7 +63,7 @@ def test_workers_that_share_lists_wait_for_each_other(
 def test_buffers_of_other_scenes_leave_no_trace(tools: SimpleNamespace) -> None:
     """A small scene after a large one, and after one that has other pixels ended."""
     small = tools.random_scene(50, 45, 30, seed=1)
-    passes._free.clear()
+    passes.clear_workspaces()
     fresh = everything(small)
     large = tools.random_scene(3000, 120, 90, seed=2)
     everything(large.with_(opacities=np.full(3000, 0.99, np.float32), scales=large.scales * 4))
@@ -91,7 +91,7 @@ def test_a_graph_can_be_walked_twice(tools: SimpleNamespace) -> None:
 
 
 def test_workspaces_come_back(tools: SimpleNamespace) -> None:
-    passes._free.clear()
+    passes.clear_workspaces()
     scene = tools.random_scene(30, 20, 20)
     for _ in range(5):
         everything(scene)
@@ -252,7 +252,7 @@ def test_lists_have_room_for_any_number_of_huge_gaussians(
     scene = scene.with_(scales=np.full((64, 3), 30.0, np.float32))
     arrays = {name: getattr(scene, name) for name in NAMES}
     for count in range(1, 65):
-        passes._free.clear()
+        passes.clear_workspaces()
         few = scene.with_(**{name: array[:count] for name, array in arrays.items()})
         with torch.no_grad():
             assert few.render("cpu")[0].alphas.min() > 0
@@ -263,7 +263,7 @@ def test_lists_that_never_have_room_are_an_error(
 ) -> None:
     scene = tools.random_scene(30, 96, 96).with_(scales=np.full((30, 3), 30.0, np.float32))
     monkeypatch.setattr(passes, "_LIST_GROWTH", 1)
-    passes._free.clear()
+    passes.clear_workspaces()
     with torch.no_grad(), pytest.raises(AssertionError, match="no room for 270 pairs of 30 Gaus"):
         scene.render("cpu")
-    passes._free.clear()
+    passes.clear_workspaces()

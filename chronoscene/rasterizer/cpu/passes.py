@@ -62,6 +62,12 @@ def _aligned(size: int, dtype: type) -> AnyArray:
     return raw[start : start + count].view(dtype)
 
 
+def clear_workspaces() -> None:
+    """Give the memory of unused workspaces back to the system."""
+    with _lock:
+        _free.clear()
+
+
 class Rendering:
     """One image on its way through the kernels, forward and backward.
 
