@@ -139,26 +139,23 @@ def with_halved_photos(train: TrainingSet) -> TrainingSet:
 
     A pixel counts where all four do, and has the depth of the nearest of their points.
     """
-    factors = [2 if v.width * v.height >= HALVED_PIXELS else 1 for v in train.views]
-    if 2 not in factors:
+    large = [view.width * view.height >= HALVED_PIXELS for view in train.views]
+    if not any(large):
         return train
 
     def load_image(i: int) -> NDArray[np.uint8]:
         image = train.load_image(i)
-        return image if factors[i] == 1 else downscale_image(image, factors[i])
+        return downscale_image(image, 2) if large[i] else image
 
     def load_mask(i: int) -> NDArray[np.bool_] | None:
         mask = train.load_mask(i)
-        return mask if mask is None or factors[i] == 1 else _halved_mask(mask)
+        return _halved_mask(mask) if large[i] and mask is not None else mask
 
     def load_depths(i: int) -> SparseDepths:
         depths = train.load_depths(i)
-        return depths if factors[i] == 1 else _halved_depths(depths, train.views[i])
+        return _halved_depths(depths, train.views[i]) if large[i] else depths
 
-    views = tuple(
-        view if factor == 1 else downscale_view(view, factor)
-        for view, factor in zip(train.views, factors, strict=True)
-    )
+    views = tuple(downscale_view(v, 2) if large[i] else v for i, v in enumerate(train.views))
     return replace(
         train, views=views, load_image=load_image, load_mask=load_mask, load_depths=load_depths
     )

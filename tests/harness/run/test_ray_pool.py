@@ -72,7 +72,7 @@ def bounded():
 
 
 class StandIn:
-    """What `RayPool` uses of Ray; two machines of one processor."""
+    """Part of Ray that `RayPool` uses, with two machines of one processor."""
 
     exceptions = SimpleNamespace(RayError=ConnectionError, RayActorError=ConnectionResetError)
 

@@ -294,7 +294,7 @@ def test_misspelt_image(scene, fix, tmp_path):
 
 
 def test_masks_of_another_spelling(scene, fix):
-    """Of macOS, for example: accents are characters of their own."""
+    """Accents are characters of their own in names of macOS, for example."""
     name = unicodedata.normalize("NFC", "pläne.png")
     scene.path("images/a000.png").rename(scene.path(f"images/{name}"))
     for place in ("sparse/0/images.txt", "sparse/split.txt"):
