@@ -9,6 +9,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# What a user has, and what tests need beside it.
+INSTALLED := $(VENV)/.installed
 READY := $(VENV)/.ready
 
 # Without a GPU the CPU build is a quarter of the size. It is tried from the indexes that pip knows,
@@ -26,7 +28,8 @@ SCENE := $(DEMO)/demo
 DEMO_METHODS := chronogs,scaffold-gs,3dgs,4dgs
 DEMO_BUDGET := 90s
 
-.PHONY: demo leaderboard test gaussian-kernels other-kernels lint mutants clean distclean
+.PHONY: demo leaderboard test lint mutants clean distclean \
+	gaussian-kernels variant-kernels scene-kernels
 
 demo: $(DEMO)/.made
 	$(BIN)/chronoscene validate $(SCENE)
@@ -40,7 +43,7 @@ demo: $(DEMO)/.made
 
 # The mark stands beside the scene: nothing is ever written into a dataset folder. A scene without
 # its mark is what an interrupted run left behind.
-$(DEMO)/.made: | $(READY)
+$(DEMO)/.made: | $(INSTALLED)
 	rm -rf $(SCENE)
 	mkdir -p $(DEMO)
 	$(BIN)/chronoscene synth $(SCENE) --preset demo
@@ -49,23 +52,27 @@ $(DEMO)/.made: | $(READY)
 SITE := build/leaderboard
 RUNS ?= $(wildcard $(DEMO)/runs)
 
-leaderboard: $(READY)
+leaderboard: $(INSTALLED)
 	rm -rf $(SITE)
 	$(BIN)/chronoscene leaderboard leaderboard/entries/measured --out $(SITE) $(RUNS:%=--runs %)
 
 # The threads of OpenBLAS wait actively, and keep those from running that they wait for: beside two
 # busy processes on two processors, 300 products of 150x150 matrices took 4.8 s, and 0.04 s so.
 test: export OPENBLAS_NUM_THREADS := 1
-test: $(READY)
-	@$(MAKE) --no-print-directory --jobs=2 lint gaussian-kernels other-kernels
+test: $(INSTALLED)
+	@$(MAKE) --no-print-directory --jobs=2 lint gaussian-kernels scene-kernels variant-kernels
 	$(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
 
-# Each process of the tests would compile them.
-gaussian-kernels: $(READY)
-	$(BIN)/python -m tests.compile_kernels chronogs 3dgs 4dgs realtime4dgs gs-w
+# Each process of the tests would compile them. They need nothing of what is installed for tests
+# meanwhile.
+gaussian-kernels: $(INSTALLED)
+	$(BIN)/python -m tests.compile_kernels chronogs 3dgs
 
-other-kernels: $(READY)
-	$(BIN)/python -m tests.compile_kernels --scene neusc
+variant-kernels: gaussian-kernels
+	$(BIN)/python -m tests.compile_kernels 4dgs realtime4dgs gs-w neusc
+
+scene-kernels: $(INSTALLED)
+	$(BIN)/python -m tests.compile_kernels --scene
 
 mutants: $(READY)
 	$(BIN)/python tests/mutants/run.py
@@ -77,7 +84,7 @@ lint: $(READY)
 
 # A torch that is in the environment already, a CUDA build perhaps, is kept. Older versions of pip
 # take half a minute more to choose among all files of an index.
-$(READY): pyproject.toml constraints.txt
+$(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "Python 3.11 or newer is needed; name one: make PYTHON=python3.11" >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv --upgrade-deps $(VENV)
@@ -85,7 +92,11 @@ $(READY): pyproject.toml constraints.txt
 		|| $(PIP) "$(TORCH)+cpu" 2>/dev/null \
 		|| $(PIP) "$(TORCH)" --index-url $(TORCH_CPU_INDEX) 2>/dev/null \
 		|| $(PIP) "$(TORCH)"
-	$(PIP) --constraint constraints.txt --editable '.[dev]'
+	$(PIP) --constraint constraints.txt --editable .
+	touch $@
+
+$(READY): $(INSTALLED)
+	$(PIP) --constraint constraints.txt --group dev
 	touch $@
 
 clean:

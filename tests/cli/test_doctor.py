@@ -57,7 +57,7 @@ def test_bare_machine_trains_and_is_told_what_to_install(bare):
 
 def test_every_extra_has_a_row():
     known = metadata("chronoscene").get_all("Provides-Extra")
-    assert {*doctor.EXTRAS, "cuda", "dev", "lpips"} == set(known)
+    assert {*doctor.EXTRAS, "cuda", "lpips"} == set(known)
 
 
 def test_full_machine(bare, monkeypatch, set_gsplat):
