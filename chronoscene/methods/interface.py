@@ -20,6 +20,10 @@ Skipped = Literal["empty", "not finite"]
 POSITIONS = ("anchors", "means")
 """Names of the tensor of positions in a stored model that is a set of anchors or Gaussians."""
 
+HALVED_PIXELS = 400_000
+"""Pixels of a photo from which the option `half_size_share` applies. Below, the time of a step
+depends on the Gaussians more than on the pixels, and half a photo shows too little of them."""
+
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class View:

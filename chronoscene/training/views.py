@@ -15,7 +15,7 @@ from torch import Tensor
 from chronoscene.kernels.runtime import views_for_threads
 from chronoscene.kernels.thread_pool import num_workers
 from chronoscene.methods import SparseDepths, TrainingSet, View
-from chronoscene.methods.interface import nothing_ahead
+from chronoscene.methods.interface import HALVED_PIXELS, nothing_ahead
 from chronoscene.training.devices import to_device
 
 V = TypeVar("V", bound=View)
@@ -25,10 +25,6 @@ SHARE_OF_GPU = 0.25
 
 COARSE_PIXELS = 320 * 240
 """Pixels of a view in which weights of Gaussians are measured, at least, if it has as many."""
-
-HALVED_PIXELS = 400_000
-"""Pixels of a photo from which `half_size_share` applies. Below, the time of a step depends on the
-Gaussians more than on the pixels, and half a photo shows too little of them."""
 
 AHEAD = 32
 """Number of draws that are known before they are made."""

@@ -48,6 +48,8 @@ class Job:
     """Differences from the preset, in words."""
     memory: int = 0
     """Bytes of memory that the run is expected to take."""
+    photo_pixels: int = 0
+    """Pixels of the largest photo that is trained on."""
     commit: str = ""
     """Commit of the code that runs it; set by the worker."""
     reports: bool = False

@@ -119,6 +119,7 @@ def _runs_of_scene(
             settings=own,
             notices=notices,
             memory=settings.job_memory or scene.needs.of_run(views),
+            photo_pixels=scene.needs.pixels,
         )
         run = method.run(job)
         check_run(run)

@@ -24,6 +24,7 @@ from chronoscene.methods import (
     build_config,
     load_spec,
 )
+from chronoscene.methods.interface import HALVED_PIXELS
 from chronoscene.methods.preset_files import find_preset
 
 _NEUTRAL = {
@@ -113,7 +114,7 @@ class ResolvedRun:
         decides = {
             "method": job.method_name,
             "preset": settings.preset_name,
-            "method_config": _known_before(deciding_options(config)),
+            "method_config": _with_effect(deciding_options(config), job.photo_pixels),
             "strategy": job.strategy,
             "stop": dataclasses.asdict(stop),
             "separate_iterations": settings.separate_iterations,
@@ -243,12 +244,15 @@ def _unusual(settings: RunSettings) -> dict[str, Any]:
     return {name: value for name in names if (value := getattr(settings, name))}
 
 
-def _known_before(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out options that came later, with the values that change nothing.
+def _with_effect(options: Mapping[str, Any], photo_pixels: int) -> dict[str, Any]:
+    """Leave out options that came later, where they change nothing.
 
     Runs of versions that did not have them are the same runs.
     """
-    return {name: value for name, value in options.items() if _NEUTRAL.get(name) != value}
+    left_out = dict(_NEUTRAL)
+    if photo_pixels < HALVED_PIXELS and "half_size_share" in options:
+        left_out["half_size_share"] = options["half_size_share"]
+    return {name: value for name, value in options.items() if left_out.get(name) != value}
 
 
 def deciding_options(config: MethodConfig) -> dict[str, Any]:
