@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations, islice
 
@@ -18,6 +18,7 @@ of them have a wrong one is 3 x 10^-12."""
 
 MAX_JUDGED = 1000  # Points that a triple is evaluated on
 MAX_TRIPLES = 5000  # Triples that are tried where points are few
+AT_ONCE = 50  # Triples that are fitted and judged in one go: more do not stay in the cache
 
 MIN_THICKNESS = 0.02
 """Spread across a line as a share of that along it, below which points fix no rotation."""
@@ -87,19 +88,28 @@ class Sim3:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """``x -> matrix @ x + translation``: the result of a fit."""
+    """``x -> matrix @ x + translation``: the result of a fit, or of many (S fits)."""
 
     matrix: Array
-    """Scale times a rotation. [3, 3]"""
+    """Scale times a rotation. [3, 3] or [S, 3, 3]"""
     translation: Array
+    """[3] or [S, 3]"""
+
+    def __len__(self) -> int:
+        return len(self.translation)
+
+    def __getitem__(self, number: int) -> Similarity:
+        """Take one of many."""
+        return Similarity(self.matrix[number], self.translation[number])
 
     @property
     def scale(self) -> float:
         return float(np.cbrt(np.linalg.det(self.matrix)))
 
     def apply(self, points: Array) -> Array:
-        """Transform points. [N, 3]"""
-        return points @ self.matrix.T + self.translation
+        """Transform points, by each of many. [N, 3] -> [N, 3] or [S, N, 3]"""
+        moved = points @ np.swapaxes(self.matrix, -1, -2)
+        return np.asarray(moved + self.translation[..., None, :])
 
     def to_sim3(self) -> Sim3:
         """Convert to a `Sim3`."""
@@ -113,34 +123,51 @@ def fit(source: Array, target: Array) -> Similarity | None:
     Args:
         source: At least three points, not on one line. [N, 3]
         target: Their targets. [N, 3]
+    """
+    found = _fit_each(source[None], target[None])
+    return found[0] if len(found) else None
+
+
+def _fit_each(source: Array, target: Array) -> Similarity:
+    """Fit as `fit` does to each of many sets; those that determine none are left out. [S, N, 3]
 
     Source: Umeyama 1991, equations 40 to 42.
     """
-    centre_source, centre_target = source.mean(axis=0), target.mean(axis=0)
-    a, b = source - centre_source, target - centre_target
-    variance = (a * a).sum()
-    covariance = b.T @ a
-    if not (variance > 0 and np.isfinite(covariance).all()):
-        return None
-    u, d, vt = np.linalg.svd(covariance)
-    if not d[1] > 1e-9 * d[0]:
-        return None
-    signs = np.ones(3)
-    if np.linalg.det(u) * np.linalg.det(vt) < 0:
-        signs[2] = -1
-    matrix = (d * signs).sum() / variance * (u * signs) @ vt
-    return Similarity(matrix, centre_target - matrix @ centre_source)
+    centre_source, centre_target = source.mean(axis=1), target.mean(axis=1)
+    a, b = source - centre_source[:, None], target - centre_target[:, None]
+    variance = (a * a).sum(axis=(1, 2))
+    covariance = np.swapaxes(b, 1, 2) @ a
+    usable = (variance > 0) & np.isfinite(covariance).all(axis=(1, 2))
+    u, d, vt = np.linalg.svd(covariance[usable])
+    signs = np.ones_like(d)
+    signs[np.linalg.det(u) * np.linalg.det(vt) < 0, 2] = -1
+    scale = (d * signs).sum(axis=1) / variance[usable]
+    matrix = scale[:, None, None] * (u * signs[:, None]) @ vt
+    translation = centre_target[usable] - (matrix @ centre_source[usable, :, None])[..., 0]
+    determined = d[:, 1] > 1e-9 * d[:, 0]
+    return Similarity(matrix[determined], translation[determined])
 
 
 def fit_samples(
-    source: Array, target: Array, samples: Iterable[Ints], cost: Callable[[Similarity], float]
+    source: Array, target: Array, samples: Ints, cost: Callable[[Similarity], Array]
 ) -> tuple[Similarity | None, float]:
-    """Fit a similarity to each sample of rows; the one of least cost, and its cost."""
+    """Fit a similarity to each sample; return the first one of least cost, and its cost.
+
+    Args:
+        source: [N, 3]
+        target: [N, 3]
+        samples: Rows of the points of each. [S, 3]
+        cost: Computes the cost of each of many similarities.
+    """
     best, least = None, np.inf
-    for rows in samples:
-        candidate = fit(source[rows], target[rows])
-        if candidate is not None and (value := cost(candidate)) < least:
-            best, least = candidate, value
+    for start in range(0, len(samples), AT_ONCE):
+        rows = samples[start : start + AT_ONCE]
+        candidates = _fit_each(source[rows], target[rows])
+        costs = cost(candidates)
+        costs = np.where(np.isnan(costs), np.inf, costs)
+        if costs.min(initial=np.inf) < least:
+            number = int(costs.argmin())
+            best, least = candidates[number], float(costs[number])
     return best, least
 
 
@@ -159,12 +186,13 @@ def fit_robustly(source: Array, target: Array, *, axes: int = 3) -> tuple[Simila
     """
     rng = np.random.default_rng(0)
     judges = rng.permutation(len(source))[:MAX_JUDGED]
-    triples = (rng.choice(len(source), 3, replace=False) for _ in range(NUM_SAMPLES))
+    triples = [rng.choice(len(source), 3, replace=False) for _ in range(NUM_SAMPLES)]
 
-    def median(candidate: Similarity) -> float:
-        return float(np.median(_distances(candidate, source[judges], target[judges], axes)))
+    def medians(candidates: Similarity) -> Array:
+        distances = _distances(candidates, source[judges], target[judges], axes)
+        return np.asarray(np.median(distances, axis=1))
 
-    best, _ = fit_samples(source, target, triples, median)
+    best, _ = fit_samples(source, target, np.array(triples), medians)
     for _ in range(3):
         if best is None:
             return None
@@ -175,7 +203,7 @@ def fit_robustly(source: Array, target: Array, *, axes: int = 3) -> tuple[Simila
 
 
 def _distances(similarity: Similarity, source: Array, target: Array, axes: int) -> Array:
-    return np.asarray(np.linalg.norm((similarity.apply(source) - target)[:, :axes], axis=1))
+    return np.asarray(np.linalg.norm((similarity.apply(source) - target)[..., :axes], axis=-1))
 
 
 def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | None:
@@ -193,13 +221,14 @@ def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | No
         return None
     used = np.ones(count, bool)
     if count >= 6:  # of five, two beside the triple could agree by chance
-        triples = map(np.array, islice(combinations(range(count), 3), MAX_TRIPLES))
-        wide = (rows for rows in triples if _thickness(source[rows]) >= MIN_THICKNESS)
+        triples = np.array([*islice(combinations(range(count), 3), MAX_TRIPLES)])
+        wide = triples[_thickness(source[triples]) >= MIN_THICKNESS]
 
-        def middle(trial: Similarity) -> float:  # the points of the triple fit by construction
-            return float(np.sort(_distances(trial, source, target, 3))[(count + 3) // 2])
+        def middles(trials: Similarity) -> Array:  # the points of a triple fit by construction
+            distances = _distances(trials, source, target, 3)
+            return np.asarray(np.sort(distances, axis=1)[:, (count + 3) // 2])
 
-        best, smallest = fit_samples(source, target, wide, middle)
+        best, smallest = fit_samples(source, target, wide, middles)
         if best is not None:
             distance = _distances(best, source, target, 3)
             spread = 3 * SIGMA * max(smallest, 1e-4 * float(np.ptp(target, axis=0).max()))
@@ -223,7 +252,8 @@ def scale_deviation(residuals: Array, target: Array) -> float:
     return float(deviation / max(spread, 1e-9))
 
 
-def _thickness(points: Array) -> float:
-    """Divide the second singular value by the first: 0 on a line."""
-    values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return float(values[1] / values[0]) if values[0] > 0 else 0.0
+def _thickness(points: Array) -> Array:
+    """Divide the second singular value by the first: 0 on a line. [..., N, 3] -> [...]"""
+    centred = points - points.mean(axis=-2, keepdims=True)
+    values = np.linalg.svd(centred, compute_uv=False)
+    return np.asarray(values[..., 1] / np.maximum(values[..., 0], np.finfo(float).tiny))

@@ -12,7 +12,15 @@ from chronoscene.scene.geometry import (
     pose_from_rotation_translation,
     rotation_from_quaternion,
 )
-from chronoscene.scene.similarity import Sim3, fit, fit_few, fit_robustly, scale_deviation
+from chronoscene.scene.similarity import (
+    AT_ONCE,
+    Sim3,
+    fit,
+    fit_few,
+    fit_robustly,
+    fit_samples,
+    scale_deviation,
+)
 
 unit = st.floats(-1, 1, allow_subnormal=False)
 rotations = (
@@ -112,6 +120,27 @@ def test_robust_fit_with_outliers():
     assert found.scale == pytest.approx(3.0, rel=1e-9)
     np.testing.assert_allclose(found.matrix, 3 * truth.rotation, atol=1e-9)
     assert distance[90:].max() < 1e-8
+
+
+@pytest.mark.parametrize("place", [0, AT_ONCE - 1, AT_ONCE, 2 * AT_ONCE + 3])
+def test_the_first_sample_of_least_cost_is_found_wherever_it_is(place):
+    source = np.random.default_rng(1).normal(size=(8, 3))
+    source[3] = source[2] = source[1]  # these three fix nothing
+    target = 2.0 * source
+    target[0] += 1.0  # all samples with it are wrong
+    samples = np.array([[0, 4, 5]] * (2 * AT_ONCE + 5))
+    samples[::2] = [1, 2, 3]
+    samples[place:] = [5, 6, 7]
+    samples[place + 1 :] = [4, 5, 6]
+
+    def costs(candidates):
+        return np.median(np.linalg.norm(candidates.apply(source) - target, axis=-1), axis=1)
+
+    found, cost = fit_samples(source, target, samples, lambda c: costs(c).round(6))
+    assert cost == 0
+    np.testing.assert_array_equal(found.matrix, fit(source[[5, 6, 7]], target[[5, 6, 7]]).matrix)
+    assert fit_samples(source, target, samples[:0], costs) == (None, np.inf)
+    assert fit_samples(source, target, np.array([[1, 2, 3]] * 3), costs) == (None, np.inf)
 
 
 def test_points_on_a_line_fix_nothing():

@@ -93,16 +93,17 @@ def align_by_points(pairs: PointPairs) -> Alignment | None:
     if len(judges) > MAX_JUDGED:
         judges = rng.choice(len(judges), MAX_JUDGED, replace=False)
     judged = pairs.select(judges)
-    samples = (
+    samples = [
         draw(rng, members, 3) if len(members) >= 3 else rng.choice(len(pairs), 3, False)
         for _ in range(TRIALS)
-    )
+    ]
 
-    def disagreement(candidate: Similarity) -> float:
-        near = residual_pixels(candidate.to_sim3(), judged) < SEARCH_PIXELS
-        return -float(weights[judges][near].sum())
+    def disagreements(candidates: Similarity) -> Array:
+        sims = [candidates[i].to_sim3() for i in range(len(candidates))]
+        near = [residual_pixels(sim, judged) < SEARCH_PIXELS for sim in sims]
+        return np.array([-weights[judges][mask].sum() for mask in near])
 
-    best, _ = fit_samples(pairs.source, pairs.target, samples, disagreement)
+    best, _ = fit_samples(pairs.source, pairs.target, np.array(samples), disagreements)
     return None if best is None else _polish(pairs, best.to_sim3(), cell)
 
 
