@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import Mock
 
 import numpy as np
@@ -85,42 +85,44 @@ def test_a_stated_focal_length_is_held_where_flat_ground_leaves_it_open(
     assert any("fits as well and is held" in r for r in result["remarks"])
 
 
-def test_a_full_model_of_the_lens_gives_focal_length_and_height(
-    tmp_path: Path, write_database: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("chronoscene.registration.reconstruct.lens.MIN_PHOTOS", 12)
-    case = flight(write_database, tmp_path, "SIMPLE_RADIAL", LENS, FOCAL)
-    result = joint(case | {"full_lens": True}, lambda *_: None)
-    focal, height = found(case)
-    assert focal == pytest.approx(FOCAL, rel=0.03)
-    assert height == pytest.approx(HEIGHT, rel=0.03)
-    assert any("all coefficients of the lens" in r for r in result["remarks"])
+class Adjusted(NamedTuple):
+    """A flight after a trial of the full model of the lens."""
+
+    remarks: list[str]
+    focal_and_height: tuple[float, float]
+    fits: int
+    """Times that the full model was fitted."""
+
+
+def adjusted(
+    write_database: Callable[..., Any], folder: Path, lens: tuple[float, ...], sample: int
+) -> Adjusted:
+    """Trial on so many of the points."""
+    module = "chronoscene.registration.reconstruct.lens"
+    case = flight(write_database, folder, "SIMPLE_RADIAL", lens, FOCAL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{module}.MIN_PHOTOS", 12)
+        patch.setattr(f"{module}.SAMPLE", sample)
+        patch.setattr(f"{module}._adjusted", spy := Mock(side_effect=full))
+        remarks = joint(case | {"full_lens": True}, lambda *_: None)["remarks"]
+    return Adjusted(remarks, found(case), spy.call_count)
 
 
 @pytest.mark.parametrize(
     ("lens", "gains"),
     [(LENS, True), pytest.param((-0.05, 0.0, 0.0, 0.0), False, marks=pytest.mark.slow)],
 )
-def test_part_of_the_points_shows_whether_a_full_model_gains_anything(
-    tmp_path: Path,
-    write_database: Callable[..., Any],
-    monkeypatch: pytest.MonkeyPatch,
-    lens: tuple[float, ...],
-    gains: bool,
+def test_a_full_model_of_the_lens_is_taken_where_part_of_the_points_shows_a_gain(
+    tmp_path: Path, write_database: Callable[..., Any], lens: tuple[float, ...], gains: bool
 ) -> None:
-    module = "chronoscene.registration.reconstruct.lens"
-    monkeypatch.setattr(f"{module}.MIN_PHOTOS", 12)
-    spy = Mock(side_effect=full)
-    monkeypatch.setattr(f"{module}._adjusted", spy)
-    results = []
-    for name, sample in (("all", 10**6), ("sample", 300)):
-        monkeypatch.setattr(f"{module}.SAMPLE", sample)
-        case = flight(write_database, tmp_path / name, "SIMPLE_RADIAL", lens, FOCAL)
-        remarks = joint(case | {"full_lens": True}, lambda *_: None)["remarks"]
-        results.append((remarks, found(case)))
-    assert results[0] == results[1]
-    assert any(("lens: focal" if gains else "gain nothing") in r for r in results[0][0])
-    assert spy.call_count == 1 + gains
+    whole = adjusted(write_database, tmp_path / "all", lens, sample=10**6)
+    assert any(("lens: focal" if gains else "gain nothing") in r for r in whole.remarks)
+    if gains:
+        assert whole.focal_and_height == pytest.approx((FOCAL, HEIGHT), rel=0.03)
+        assert any("all coefficients of the lens" in r for r in whole.remarks)
+    part = adjusted(write_database, tmp_path / "sample", lens, sample=300)
+    assert part[:2] == whole[:2]
+    assert (whole.fits, part.fits) == (1, gains)
 
 
 def test_a_wrong_focal_length_in_the_metadata_does_no_harm(make_case: Callable[..., Any]) -> None:
