@@ -137,7 +137,7 @@ def test_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
             raise StopError
 
     with pytest.raises(StopError):
-        generate(tmp_path / "scene", preset("tiny", **SMALL), stop)
+        generate(tmp_path / "scene", preset("tiny", **SMALL, periods=1), stop)
     assert not list(tmp_path.iterdir())
 
 

@@ -17,11 +17,11 @@ def call(*args: str) -> object:
 
 def test_makes_the_scene_that_the_options_ask_for(tmp_path: Path) -> None:
     out = tmp_path / "place"
-    options = "--preset tiny --periods 3 --size 40x30 --views 4 --points 60 --seed 5 --off-centre"
+    options = "--preset tiny --periods 1 --size 40x30 --views 4 --points 60 --seed 5 --off-centre"
     assert call(str(out), *options.split()) == 0
     scene = scene_format.read(out)
     camera = scene.frames[0].camera
-    assert scene.num_periods == 3
+    assert scene.num_periods == 1  # two without the option
     assert (camera.width, camera.height) == (40, 30)
     assert camera.params[2] != 20
     assert 0 < len(scene.points) <= 60
