@@ -14,6 +14,9 @@ from chronoscene.rasterizer.constants import EPS2D
 
 from .scenes import SmallScene
 
+BAND = 1e-4
+"""How far, relatively, thresholds are moved to find the pixels to leave out."""
+
 
 @contextmanager
 def thresholds(**values: float) -> Iterator[None]:
@@ -35,6 +38,11 @@ def steady_pixels(scene: SmallScene, band: float) -> torch.Tensor:
     decides on which side such a pixel falls. They are found by moving the thresholds by more than
     rounding can.
     """
+    return _steady_and_alphas(scene, band)[0]
+
+
+def _steady_and_alphas(scene: SmallScene, band: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """The pixels of `steady_pixels`, and the alphas of all. [C, H, W, 1]"""
     with torch.no_grad():
         base = scene.render("reference", torch.float64)[0]
         steady = torch.ones_like(base.alphas, dtype=torch.bool)
@@ -46,7 +54,7 @@ def steady_pixels(scene: SmallScene, band: float) -> torch.Tensor:
                 steady &= ~(moved | (other.alphas != base.alphas))
         for c in range(len(steady)):
             steady[c, ..., 0] &= ~_at_the_cap(scene, c, band)
-    return steady
+    return steady, base.alphas
 
 
 def _at_the_cap(scene: SmallScene, c: int, band: float) -> torch.Tensor:
@@ -78,6 +86,8 @@ class Comparison:
     got: dict[str, np.ndarray]
     expected: dict[str, np.ndarray]
     steady: np.ndarray
+    counted: torch.Tensor
+    """Pixels that the loss weighs."""
 
     def error(self, name: str, floor: float = 1e-37) -> float:
         """Largest difference, relative to the largest magnitude, of at least ``floor``."""
@@ -117,14 +127,12 @@ class Comparison:
         return np.where(length > 0, stretching / np.maximum(length, 1e-37), 0.0)
 
 
-def counted_pixels(scene: SmallScene, steady: torch.Tensor) -> torch.Tensor:
-    """Steady pixels; with depth only those where the reference shows something, as the depth of
-    what is hardly there is not well defined. Both sides of a comparison count the same ones: an
-    opacity may be the limit itself. [C, H, W, 1]"""
-    if not scene.render_depth:
-        return steady
-    with torch.no_grad():
-        return steady & (scene.render("reference", torch.float64)[0].alphas > 0.1)
+def steady_and_counted(scene: SmallScene, band: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Steady pixels, and those of them that count: with depth only those where the reference shows
+    something, as the depth of what is hardly there is not well defined. Both sides of a comparison
+    count the same ones: an opacity may be the limit itself. [C, H, W, 1]"""
+    steady, alphas = _steady_and_alphas(scene, band)
+    return steady, steady & (alphas > 0.1) if scene.render_depth else steady
 
 
 def run(
@@ -183,7 +191,7 @@ def compare(
     device: str = "cpu",
     *,
     truth: SmallScene | None = None,
-    band: float = 1e-4,
+    band: float = BAND,
 ) -> Comparison:
     """Run a backend, and the reference in float64 on the same numbers.
 
@@ -194,14 +202,14 @@ def compare(
         band: How far, relatively, the thresholds are moved to find the pixels to leave out.
     """
     truth = truth or scene
-    steady = steady_pixels(truth, band)
-    counted = counted_pixels(truth, steady)
+    steady, counted = steady_and_counted(truth, band)
     dtype = torch.float64 if scene.means.dtype == np.float64 else torch.float32
     return Comparison(
         truth,
         got=run(scene, backend, dtype, device, counted),
         expected=run(truth, "reference", torch.float64, "cpu", counted),
         steady=steady.numpy(),
+        counted=counted,
     )
 
 
@@ -213,7 +221,7 @@ def at_camera(scene: SmallScene) -> SmallScene:
     return scene.with_(means=means - origin, viewmats=viewmats)
 
 
-def rounding(scene: SmallScene, *, fixed: bool = False) -> Comparison:
+def rounding(comparison: Comparison, *, fixed: bool = False) -> Comparison:
     """The reference beside itself with every input moved by up to one unit of its last float32
     place: the error that float32 inputs have before anything is computed.
 
@@ -221,20 +229,29 @@ def rounding(scene: SmallScene, *, fixed: bool = False) -> Comparison:
     counts is where things are as seen from the first camera, not where the origin is.
 
     Args:
-        scene: Any.
+        comparison: Of any scene; what it says of the reference is not computed again where the
+            first camera is the origin.
         fixed: Leave positions and cameras as they are.
     """
-    scene = at_camera(scene)
-    steady = steady_pixels(scene, 1e-4)
-    counted = counted_pixels(scene, steady)
-    expected = run(scene, "reference", torch.float64, "cpu", counted)
-    worst = dict(expected)
+    base = _seen_from_its_camera(comparison)
+    worst = dict(base.expected)
     for seed in range(4):
-        other = run(_moved(scene, seed, fixed), "reference", torch.float64, "cpu", counted)
-        for name, base in expected.items():
-            if base.size and np.abs(other[name] - base).max() > np.abs(worst[name] - base).max():
+        moved = _moved(base.scene, seed, fixed)
+        other = run(moved, "reference", torch.float64, "cpu", base.counted)
+        for name, usual in base.expected.items():
+            if usual.size and np.abs(other[name] - usual).max() > np.abs(worst[name] - usual).max():
                 worst[name] = other[name]
-    return Comparison(scene, worst, expected, steady.numpy())
+    return replace(base, got=worst)
+
+
+def _seen_from_its_camera(comparison: Comparison) -> Comparison:
+    """The reference on both sides, with the origin at the first camera."""
+    before, scene = comparison.scene, at_camera(comparison.scene)
+    if all(np.array_equal(getattr(before, n), getattr(scene, n)) for n in ("means", "viewmats")):
+        return replace(comparison, expected=dict(comparison.expected))
+    steady, counted = steady_and_counted(scene, BAND)
+    expected = run(scene, "reference", torch.float64, "cpu", counted)
+    return Comparison(scene, expected, dict(expected), steady.numpy(), counted)
 
 
 def _moved(scene: SmallScene, seed: int, fixed: bool) -> SmallScene:

@@ -66,11 +66,15 @@ def _project(scene: SmallScene, i: int) -> dict[str, Any] | None:
         jacobian[k, 2] = -f / p[2] * min(max(ratio, -c / f - margin), (size - c) / f + margin)
         centre.append(f * ratio + c)
     blur = mpf(dict(scene.options).get("eps2d", EPS2D))
-    sharp = (jacobian * axes) * (jacobian * axes).T
-    covariance, opacity = sharp + blur * mpmath.eye(2), mpf(float(scene.opacities[i]))
+    seen = jacobian * axes
+    sharp, opacity = seen * seen.T, mpf(float(scene.opacities[i]))
+    # Written out, as is the quadratic form below: matrices of mpmath take ten times as long.
+    xx, xy, yy = sharp[0, 0] + blur, sharp[0, 1], sharp[1, 1] + blur
+    determinant = xx * yy - xy * xy
     if dict(scene.options).get("antialiased"):
-        opacity *= mpmath.sqrt(mpmath.det(sharp) / mpmath.det(covariance))
-    found = {"i": i, "depth": p[2], "centre": centre, "conic": covariance**-1}
+        opacity *= mpmath.sqrt(mpmath.det(sharp) / determinant)
+    conic = (yy / determinant, -xy / determinant, xx / determinant)
+    found = {"i": i, "depth": p[2], "centre": centre, "conic": conic}
     return found | {"opacity": opacity}
 
 
@@ -79,8 +83,10 @@ def _composite(
 ) -> list[float]:
     light, values = mpf(1), [mpf(0)] * scene.colors.shape[1]
     for s in splats:
-        d = mpmath.matrix([column + mpf(0.5) - s["centre"][0], row + mpf(0.5) - s["centre"][1]])
-        alpha = s["opacity"] * mpmath.exp(-(d.T * s["conic"] * d)[0] / 2)
+        dx, dy = column + mpf(0.5) - s["centre"][0], row + mpf(0.5) - s["centre"][1]
+        xx, xy, yy = s["conic"]
+        power = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
+        alpha = s["opacity"] * mpmath.exp(-power / 2)
         if alpha < ALPHA_MIN:
             continue
         alpha = min(alpha, mpf(ALPHA_MAX))
