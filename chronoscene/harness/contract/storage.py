@@ -13,7 +13,6 @@ import numpy as np
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.contract.subject import (
-    PAUSE,
     NotApplicableError,
     Subject,
     contents,
@@ -22,6 +21,7 @@ from chronoscene.harness.contract.subject import (
     same_files,
     tensors_of,
 )
+from chronoscene.harness.contract.tiny_training import PAUSE
 from chronoscene.harness.train.checks import check_size, refuse
 from chronoscene.methods import POSITIONS
 
