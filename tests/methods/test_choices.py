@@ -19,7 +19,8 @@ from chronoscene.methods import build_config, import_object, load_spec, method_n
 from .small_fields import SMALL_FIELD
 
 STEPS = 16  # each photo once
-FIELD_STEPS = 6
+FIELD_STEPS = 3
+DEEP_STEPS = 4  # of ResNet-18, each of which takes as long as ten others
 NEEDS_MORE = {"densification=mcmc", "fusion=sum"}
 """Choices that are refused without another option, whose name the message has."""
 
@@ -74,6 +75,8 @@ def test_every_choice_trains_or_is_refused(
         steps, small = FIELD_STEPS, SMALL_FIELD | {"samples": 512}
         if value == "frequencies":  # refused beside options of a grid
             small = {name: small[name] for name in small if name not in GRID_OPTIONS}
+    elif value == "resnet18":
+        steps = DEEP_STEPS
     overrides = {"iterations": steps, **small, option: value}
     try:
         config = build_config(spec, preset="fast", overrides=overrides)
