@@ -299,7 +299,9 @@ def test_what_is_gone_in_a_period_leaves_a_ghost() -> None:
         for v in scene.views
     ]
     wild = train(
-        replace(scene, load_image=images.__getitem__), config(), method_class=GaussianInTheWild
+        replace(scene, load_image=images.__getitem__),
+        config(iterations=110),
+        method_class=GaussianInTheWild,
     )
     view = ring_of_views(7)[2]
     first, second = (wild.render(view, float(period)) for period in (0, 1))
