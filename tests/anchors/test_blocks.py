@@ -71,7 +71,7 @@ def test_blocks_decay_to_the_mean_of_their_anchor(
     anchors: int, periods: int, seed: int, share: float, kernels: bool
 ) -> None:
     count, every = shared_rows(anchors, periods, seed)
-    rows = every[:, : 1 + seed % periods]  # the other periods take no part
+    rows = every[:, torch.arange(1 + seed % periods)]  # the other periods take no part
     blocks = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
     before, others = blocks[rows].double().numpy(), np.setdiff1d(every, rows)
     kept = blocks[others].clone()
