@@ -36,8 +36,9 @@ _SHORT: dict[str, Any] = _FULL | {
 docs/experiments have the trials; generalisation.md those of the dropout of ``accurate``: long
 trainings learn photos by heart."""
 
-_HELD: dict[str, Any] = _SHORT | {"depth_weight": 0.1}
-"""The same with surfaces that are held to the sparse points; not tried in ``accurate``."""
+_HELD: dict[str, Any] = _SHORT | {"depth_weight": 0.1, "half_size_share": 0.5}
+"""The same with surfaces that are held to the sparse points, and with large photos at half size
+first; neither was tried in ``accurate``."""
 
 _TEXT: dict[str, Any] = {
     "fusion": "sum",
