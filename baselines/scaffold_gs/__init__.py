@@ -18,7 +18,7 @@ _SHORT: dict[str, Any] = {
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
-    "fast": _SHORT | {"iterations": 1_000, "density_interval": 40},
+    "fast": _SHORT | {"iterations": 1_000, "density_interval": 40, "half_size_share": 0.5},
     "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
     "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50, **MANY_ANCHORS},
 }
