@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from chronoscene.harness.contract import CHECKS
-from chronoscene.harness.contract.subject import NotApplicableError, Subject, train_elsewhere
-from chronoscene.harness.contract.tiny_training import PAUSE, STEPS
+from chronoscene.harness.contract.subject import PAUSE, NotApplicableError, Subject, train_elsewhere
+from chronoscene.harness.contract.tiny_training import STEPS
 from chronoscene.harness.contract.training import (
     equal_seeds_give_equal_bytes,
     threads_change_nothing_for_many_points,

@@ -23,7 +23,7 @@ from rounding import raise_eps
 from chronoscene.errors import CheckpointError
 from chronoscene.fields.config import FieldConfig
 from chronoscene.harness.contract import tiny_training
-from chronoscene.harness.contract.tiny_training import PAUSE
+from chronoscene.harness.contract.subject import PAUSE
 from chronoscene.harness.train import painted_balls
 from chronoscene.methods import (
     Method,

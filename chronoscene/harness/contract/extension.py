@@ -9,18 +9,15 @@ from numpy.typing import NDArray
 
 from chronoscene.harness.contract import tiny_training
 from chronoscene.harness.contract.subject import (
+    PAUSE,
     NotApplicableError,
     Subject,
     demand,
     go_on,
     same_files,
 )
-from chronoscene.harness.contract.tiny_training import PAUSE
 from chronoscene.harness.contract.training import below_a_constant_image
 from chronoscene.methods import Method, TrainingSet, has_function
-
-LATE_PAUSE = 90
-"""Steps after which the training on a further period is interrupted."""
 
 
 def a_further_period_is_learned(subject: Subject) -> None:
@@ -33,14 +30,14 @@ def a_further_period_is_learned(subject: Subject) -> None:
     hide = subject.spec.period_input == "none"
     first, second, third = (tiny_training.make_stage(i, hide_period=hide) for i in range(3))
     method, between, folder = subject.begun(first), subject.folder(), subject.folder()
-    go_on(method, 0, PAUSE, total=PAUSE)
+    go_on(method, 0)
     if subject.spec.resumable:
         method.save_training(between)
     method.extend(second)
-    go_on(method, 0, LATE_PAUSE)
+    go_on(method, 0, PAUSE)
     if subject.spec.resumable:
         method.save_training(folder)
-    reports = go_on(method, LATE_PAUSE)
+    reports = go_on(method, PAUSE)
     below_a_constant_image(method, second)
     model = subject.save(method)
     if subject.spec.resumable:
@@ -48,9 +45,7 @@ def a_further_period_is_learned(subject: Subject) -> None:
         again.load_training(between)
         again.extend(second)
         again.load_training(folder)
-        demand(
-            go_on(again, LATE_PAUSE) == reports, "steps after extend and load_training", "the same"
-        )
+        demand(go_on(again, PAUSE) == reports, "steps after extend and load_training", "the same")
         same_files(subject.save(again), model, "training after extend", "equal models")
     before = _images(method, second)
     method.extend(third)

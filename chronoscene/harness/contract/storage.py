@@ -13,6 +13,7 @@ import numpy as np
 
 from chronoscene.errors import CheckpointError
 from chronoscene.harness.contract.subject import (
+    PAUSE,
     NotApplicableError,
     Subject,
     contents,
@@ -21,7 +22,6 @@ from chronoscene.harness.contract.subject import (
     same_files,
     tensors_of,
 )
-from chronoscene.harness.contract.tiny_training import PAUSE
 from chronoscene.harness.train.checks import check_size, refuse
 from chronoscene.methods import POSITIONS
 

@@ -29,6 +29,9 @@ from chronoscene.methods import (
     make_method,
 )
 
+PAUSE = 63
+"""Steps after which a training is interrupted; densification has begun by then."""
+
 
 class NotApplicableError(Exception):
     """A check that does not apply to a method, with the reason."""
@@ -71,23 +74,14 @@ class Subject:
         return self.save(self.method)
 
     @cached_property
-    def _paused(self) -> Method:
-        """The method after `PAUSE` steps."""
-        steps, total = tiny_training.PAUSE, tiny_training.STEPS
-        return tiny_training.train(self.spec, self.data, steps=steps, total=total)[0]
-
-    @cached_property
-    def early_model(self) -> Path:
-        """Folder of the model that was saved after `PAUSE` steps."""
-        return self.save(self._paused)
-
-    @cached_property
     def interrupted(self) -> Path:
         """Folder of a training that was saved after `PAUSE` steps."""
         if not self.spec.resumable:
             raise NotApplicableError("the method cannot be resumed")
+        method = self.begun()
+        go_on(method, 0, PAUSE)
         folder = self.folder()
-        self._paused.save_training(folder)
+        method.save_training(folder)
         return folder
 
     @cached_property
@@ -128,11 +122,9 @@ class Subject:
         return folder
 
 
-def go_on(
-    method: Method, start: int, stop: int = tiny_training.STEPS, *, total: int = tiny_training.STEPS
-) -> list[StepReport]:
-    """Do some of the steps of a training on painted balls that is over after ``total``."""
-    return [method.step(i, i / total) for i in range(start, stop)]
+def go_on(method: Method, start: int, stop: int = tiny_training.STEPS) -> list[StepReport]:
+    """Do some steps of the training on painted balls."""
+    return [method.step(i, i / tiny_training.STEPS) for i in range(start, stop)]
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -31,8 +31,6 @@ from chronoscene.methods import (
 from chronoscene.scene import Camera, Frame, Period, Points, Scene, Split
 
 STEPS = 120
-PAUSE = 63
-"""Steps after which a training is interrupted; densification has begun by then."""
 
 
 def make_stage(period: int, *, hide_period: bool) -> TrainingSet:
@@ -103,13 +101,11 @@ def train(
     seed: int = 0,
     threads: int = 1,
     steps: int = STEPS,
-    total: int | None = None,
     probe: bool = False,
 ) -> tuple[Method, list[StepReport]]:
     """Train as the harness does; ``probe`` renders now and then in between.
 
-    The training is over after ``total`` steps, or else after as many as are done. So small a scene
-    is quicker on one thread.
+    So small a scene is quicker on one thread.
     """
     set_threads(threads)
     seed_everything(seed)
@@ -117,19 +113,18 @@ def train(
     method.setup(data, seed=seed, device="cpu")
     reports = []
     for index in range(steps):
-        reports.append(method.step(index, index / (total or steps)))
+        reports.append(method.step(index, index / steps))
         if probe and index % 25 == 3:
             method.render(data.views[0], 0.0)
     return method, reports
 
 
 def main() -> None:
-    """Train methods for `PAUSE` steps, probing, and save them."""
+    """Train methods, probing, and save them."""
     out = Path(sys.argv[1])
     for name in sys.argv[2:]:
         spec = load_spec(name)
-        data = make_training_set(periods_for(spec))
-        method, _ = train(spec, data, steps=PAUSE, total=STEPS, probe=True)
+        method, _ = train(spec, make_training_set(periods_for(spec)), probe=True)
         (out / spec.name).mkdir()
         method.save(out / spec.name)
 
