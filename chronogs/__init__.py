@@ -37,7 +37,7 @@ docs/experiments have the trials; generalisation.md those of the dropout of ``ac
 trainings learn photos by heart."""
 
 _HELD: dict[str, Any] = _SHORT | {"depth_weight": 0.1, "half_size_share": 0.5}
-"""The same with surfaces that are held to the sparse points, and with large photos at half size
+"""`_SHORT` with surfaces that are held to the sparse points, and with large photos at half size
 first; neither was tried in ``accurate``."""
 
 _TEXT: dict[str, Any] = {

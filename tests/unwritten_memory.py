@@ -32,11 +32,10 @@ def filled_with_nan() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("empty", "empty_like"):
             patch.setattr(np, name, filling(getattr(np, name)))
-        # torch.use_deterministic_algorithms imports Inductor as well, which takes three seconds.
-        torch._C._set_deterministic_algorithms(True, warn_only=True)
+        torch.use_deterministic_algorithms(True, warn_only=True)
         deterministic.fill_uninitialized_memory = True
         try:
             yield
         finally:
-            torch._C._set_deterministic_algorithms(before[0])
+            torch.use_deterministic_algorithms(before[0])
             deterministic.fill_uninitialized_memory = before[1]

@@ -249,10 +249,8 @@ def _with_effect(options: Mapping[str, Any], photo_pixels: int) -> dict[str, Any
 
     Runs of versions that did not have them are the same runs.
     """
-    left_out = dict(_NEUTRAL)
-    if photo_pixels < HALVED_PIXELS and "half_size_share" in options:
-        left_out["half_size_share"] = options["half_size_share"]
-    return {name: value for name, value in options.items() if left_out.get(name) != value}
+    idle = {"half_size_share"} if photo_pixels < HALVED_PIXELS else set()
+    return {k: v for k, v in options.items() if k not in idle and _NEUTRAL.get(k) != v}
 
 
 def deciding_options(config: MethodConfig) -> dict[str, Any]:

@@ -37,6 +37,19 @@ def changed(change: dict[str, Any]) -> Job:
     return replace(JOB, **own).with_settings(**others)
 
 
+def test_a_share_at_half_size_counts_where_a_photo_is_large():
+    origin = JOB.origin.model_copy(update={"method": "chronogs"})
+
+    def document(share, pixels):
+        options = {"preset": "fast", "overrides": {"half_size_share": share}}
+        return resolve(changed({"origin": origin, "photo_pixels": pixels, **options})).document
+
+    without, halved = ([document(s, n) for n in (399_999, 400_000)] for s in ("0", "0.5"))
+    assert len({found["config_hash"] for found in (*without, halved[0])}) == 1
+    assert halved[1]["config_hash"] != without[1]["config_hash"]
+    assert halved[1]["config"]["method_config"]["half_size_share"] == 0.5
+
+
 @pytest.mark.parametrize("character", ["a", "日", "\U0001f327", "/", '"'])
 def test_folders_of_runs_have_names_that_file_systems_allow(character):
     names = [changed({"variant": f"s={character * n}"}).folder.parent.name for n in (9, 150, 999)]

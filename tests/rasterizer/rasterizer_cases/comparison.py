@@ -15,7 +15,7 @@ from chronoscene.rasterizer.constants import EPS2D
 from .scenes import SmallScene
 
 BAND = 1e-4
-"""How far, relatively, thresholds are moved to find the pixels to leave out."""
+"""Relative distance by which thresholds are moved to find the pixels to leave out."""
 
 
 @contextmanager
