@@ -67,6 +67,12 @@ def write_model(model: pycolmap.Reconstruction, folder: Path, form: str) -> None
         (folder / "frames.bin").unlink()
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One process more than processors: some wait for a browser, a server or a killed process."""
+    return runtime.available_threads() + 1
+
+
 def pytest_collection_finish() -> None:
     """Modules and tests stay to the end: looking through them for garbage takes a twelfth of the
     time, and looking for it as often as Python does up to a twentieth."""
