@@ -47,6 +47,10 @@ _SYSTEM = "check the reference system of the points, and the order east, north, 
 UPWARDS = 0.5
 """Mean sine of the elevations of all views, above which the photos look at what is above them."""
 
+HEIGHT_GAP = 5.0
+"""Metres between surveyed heights and those of GPS from which on a sentence says so. Receivers err
+by as much in height, and systems of height differ by more: neither is an error of the survey."""
+
 _MOST_AGREE = "the other control points agree with each other, but not with it"
 
 POSITION_THRESHOLDS: dict[str, Threshold] = {
@@ -206,6 +210,8 @@ def judge_position(model: Registered, ties: TieAlignment | None = None) -> Posit
     if found is None and control is None and gps is None and not objections:
         level = "not checked"
     text = _words(level, objections, found, left_out, ties) + precision(model)
+    if points and gps is not None:
+        text += _heights(model)
     if level == "not checked" and model.georeference is not None:
         text = "The model lies where the scene that it extends does; nothing else measures that."
     return Position(
@@ -269,6 +275,27 @@ def _errors(place: str, rmse: Rmse | None, pixel: float | None) -> Iterator[Obje
     for key, value in (("horizontal", rmse.horizontal), ("vertical", rmse.vertical)):
         note = f" ({value:.3g} m; largest error {rmse.largest:.3g} m, {rmse.worst})"
         yield from check(POSITION_THRESHOLDS[key], value / pixel, place, key, note)
+
+
+def _heights(model: Registered) -> str:
+    """Tell if surveyed heights differ from those of GPS, all in one direction."""
+    errors = _gps_errors(model)[1][:, 2]
+    gap = float(np.median(errors))
+    scattered = np.median(np.abs(errors - gap)) > abs(gap) / 3
+    if abs(gap) < HEIGHT_GAP or scattered or not _states_heights(model):
+        return ""
+    return (
+        f" The surveyed heights are {abs(gap):.3g} m {'above' if gap > 0 else 'below'} those of "
+        "GPS: heights may be above the sea, the ellipsoid or the place of take-off, and receivers "
+        "err by metres."
+    )
+
+
+def _states_heights(model: Registered) -> bool:
+    """Find out if the GPS positions have heights; unknown ones are all set to 0."""
+    assert model.georeference is not None
+    heights = model.georeference.to_geodetic(model.gps_enu[_with_used_gps(model)])[:, 2]
+    return bool(np.ptp(heights) > 0.01)
 
 
 def _turned_over(model: Registered) -> Iterator[Objection]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -137,6 +138,25 @@ def test_control_that_is_off_in_height(
     assert [f.check for f in position.objections] == ["vertical"]
     errors = {r.name: r.error for r in ties.residuals}
     assert errors["c1"] is not None and errors["c1"][2] == pytest.approx(metres, abs=0.2)
+
+
+@pytest.mark.parametrize(("metres", "said"), [(47.3, True), (-47.3, True), (3.0, False)])
+def test_another_system_of_heights_than_that_of_gps_is_named(
+    tmp_path: Path, made: Generated, metres: float, said: bool
+) -> None:
+    off = dict.fromkeys(range(8), (0.0, 0.0, metres))
+    file = survey(tmp_path / "s.csv", made, checks=(1, 3, 7), off=off)
+    ties, position = judged(made.model, file)
+    assert position.level == "pass" and position.text.startswith("Check points")
+    assert ("those of GPS" in position.text) == said
+    if said:
+        found = re.search(r"are (\S+) m (above|below) those of GPS", position.text)
+        assert found is not None and float(found[1]) == pytest.approx(abs(metres), abs=0.5)
+        assert found[2] == ("above" if metres > 0 else "below")
+    # Without heights, GPS says nothing about them.
+    latitude, longitude, _ = FRAME.to_geodetic(ties.model.gps_enu).T
+    flat = FRAME.to_enu(latitude, longitude, np.zeros(len(latitude)))
+    assert "those of GPS" not in judge_position(replace(ties.model, gps_enu=flat), ties).text
 
 
 def test_a_wrong_control_point_is_named_and_left_out(tmp_path: Path, made: Generated) -> None:
