@@ -4,6 +4,7 @@ import gc
 import os
 import shutil
 from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
@@ -65,12 +66,6 @@ def write_model(model: pycolmap.Reconstruction, folder: Path, form: str) -> None
     if form == "old":
         (folder / "rigs.bin").unlink()
         (folder / "frames.bin").unlink()
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
-    """One process more than processors: some wait for a browser, a server or a killed process."""
-    return runtime.available_threads() + 1
 
 
 def pytest_collection_finish() -> None:
@@ -196,12 +191,25 @@ def set_gsplat(monkeypatch: pytest.MonkeyPatch) -> Generator[Callable[[str | Non
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Chromium of the system, without a screen."""
+    """Chromium of the system, without a screen and without WebGL, which is slow on a CPU."""
+    with _chromium("--disable-gpu") as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def browser_with_webgl() -> Iterator[Any]:
+    """The same for pages that draw in three dimensions."""
+    options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with _chromium(*options) as opened:
+        yield opened
+
+
+@contextmanager
+def _chromium(*options: str) -> Iterator[Any]:
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
     if program is None:
         pytest.skip("no Chromium here")
-    options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with api.sync_playwright() as playwright:
         opened = playwright.chromium.launch(
             executable_path=program, args=[*options, "--no-sandbox"]

@@ -302,12 +302,12 @@ def our_images(run, scene, frame):
     ]
 
 
-def test_in_a_browser(bench_here, tmp_path, browser):
+def test_in_a_browser(bench_here, tmp_path, browser_with_webgl):
     outcome, _ = bench_here("chronogs", preset="fast", iterations=150)
     make_page(outcome.finished, tmp_path / "page")
     run = open_run(outcome.finished[0])
     scene = run.scene()
-    page = browser.new_page(viewport={"width": 320, "height": 240})
+    page = browser_with_webgl.new_page(viewport={"width": 320, "height": 240})
     page.set_default_timeout(30000)
     problems: list[str] = []
     page.on("console", lambda message: problems.append(message.text))
@@ -354,14 +354,14 @@ def test_in_a_browser(bench_here, tmp_path, browser):
     assert problems == []
 
 
-def test_many_periods_and_long_names_on_a_phone(trained, tmp_path, browser):
+def test_many_periods_and_long_names_on_a_phone(trained, tmp_path, browser_with_webgl):
     make_page([trained["chronogs"]], tmp_path / "page")
     index = tmp_path / "page" / "index.html"
     text = index.read_text(encoding="utf-8")
     names = [f"the {i}th day of the year 2016" for i in range(12)]
     text = text.replace('["spring","autumn"]', json.dumps(names))
     index.write_text(text, encoding="utf-8")
-    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page = browser_with_webgl.new_page(viewport={"width": 390, "height": 844})
     page.goto(index.as_uri())
     page.evaluate("viewer.ready")
     for width in (320, 390):

@@ -257,9 +257,9 @@ def test_a_scene_has_points_and_cameras(scene_folder, serve):
     assert not browser.pictures()
 
 
-def test_in_chromium(trained, serve, browser):
+def test_in_chromium(trained, serve, browser_with_webgl):
     server = serve(content_of(trained["3dgs-period"]))
-    page = browser.new_page(viewport={"width": 640, "height": 300})
+    page = browser_with_webgl.new_page(viewport={"width": 640, "height": 300})
     page.set_default_timeout(30000)
     problems = []
     page.on("pageerror", lambda error: problems.append(str(error)))
