@@ -66,10 +66,10 @@ class Options:
         return (self.work or Path(f"{out.resolve()}.work")).resolve()
 
     def record(self) -> dict[str, Any]:
-        """Options that are set, for the log."""
+        """Options that are set, for the log; paths hold wherever a later command starts."""
         values = {name: getattr(self, name) for name in self.__slots__}
         return {
-            name: str(value) if isinstance(value, Path) else value
+            name: str(value.absolute()) if isinstance(value, Path) else value
             for name, value in values.items()
             if value is not None
         }

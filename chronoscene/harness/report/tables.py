@@ -131,7 +131,7 @@ def with_columns(made: Iterable[Table], names: Sequence[str]) -> list[Table]:
     Raises:
         ConfigError: If a name is the head of no column.
     """
-    kept, known = [], set()
+    kept, known = list[Table](), set[str]()
     for table in made:
         chosen, heads, group, last = [*range(table.labels)], [*table.heads[: table.labels]], "", ""
         for j, (first, second) in [*enumerate(table.head_lines)][table.labels :]:
@@ -147,11 +147,18 @@ def with_columns(made: Iterable[Table], names: Sequence[str]) -> list[Table]:
         rows = [[row[j] for j in chosen] for row in table.rows]
         ranks = {(i, places[j]): rank for (i, j), rank in table.ranks.items() if j in places}
         ties = {(i, places[j]) for i, j in table.ties if j in places}
-        if len(chosen) > table.labels:
-            kept.append(replace(table, heads=heads, rows=rows, ranks=ranks, ties=ties))
+        shown = replace(table, heads=heads, rows=rows, ranks=ranks, ties=ties)
+        if len(chosen) > table.labels and not any(_repeats(shown, other) for other in kept):
+            kept.append(shown)
     for name in names:
         check_choice("--columns", name, sorted(known))
     return kept
+
+
+def _repeats(table: Table, other: Table) -> bool:
+    """Return True if both show the same of one scene, as means do without and with costs."""
+    same = table.heads == other.heads and table.rows == other.rows
+    return same and table.title.startswith(other.title)
 
 
 def tables_text(

@@ -5,7 +5,7 @@ import errno
 import io
 import json
 import os
-from shutil import copytree
+from shutil import copytree, rmtree
 
 import pytest
 from command_line import invoke, succeed
@@ -180,6 +180,20 @@ def test_names_and_columns_can_be_chosen(tmp_path):
     assert [line for line in text.splitlines() if line.endswith(r" \\")] == [
         *(r"method & macro \\", r"Ours & \textbf{20.00} \\", r"4DGS & 10.00 \\"),
         *(r"method & training [s] \\", r"Ours & 10.0 \\", r"4DGS & 10.0 \\"),
+    ]
+
+
+def test_columns_that_two_tables_have_are_shown_once(runs):
+    rmtree(runs / "plaza" / "m-joint-fast" / "seed1")  # one table has the spread of seeds
+
+    def titles(columns):
+        lines = table(runs, "--columns", columns).splitlines()
+        return [line for line in lines if line.startswith("plaza: ")]
+
+    assert titles("PSNR,checkpoint") == ["plaza: macro means"]
+    assert titles("PSNR,checkpoint,training") == [
+        "plaza: macro means",
+        "plaza: macro means and cost",
     ]
 
 
