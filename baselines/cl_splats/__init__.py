@@ -34,7 +34,13 @@ SPEC = MethodSpec(
         "paper-released": {"iterations": 100},
         "accurate": _SHORT | {"iterations": 8_000, "reset_interval": 7_500},
         "balanced": _SHORT | {"iterations": 3_000, "reset_interval": 8_000},
-        "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000, "depth_weight": 0.1},
+        "fast": _SHORT
+        | {
+            "iterations": 1_000,
+            "reset_interval": 30_000,
+            "depth_weight": 0.1,
+            "half_size_share": 0.5,
+        },
     },
     strategy="sequential",
     per_period=("paper", "paper-released"),
