@@ -198,7 +198,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def browser_with_webgl() -> Iterator[Any]:
-    """The same for pages that draw in three dimensions."""
+    """Chromium with WebGL, for pages that draw in three dimensions."""
     options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with _chromium(*options) as opened:
         yield opened
