@@ -73,7 +73,7 @@ class PeriodModel(GaussianModel):
 
     def keep(self, kept: dict[str, Tensor]) -> None:
         """Put other Gaussians in the place of those that are kept."""
-        self.kept, self._living = kept, None
+        self.kept, self._living, self.is_final = kept, None, False
 
     def begin(self, period: int, changed: Tensor, new: Mapping[str, Tensor]) -> None:
         """Keep all Gaussians, and train copies of those that changed, with new ones.

@@ -73,9 +73,10 @@ class Row:
 def candidates(repeats: int) -> list[Candidate]:
     """Ours with one thread, two and all; then the others."""
     most = available_threads()
-    ours = [Candidate("cpu", n, cpu.make, repeats) for n in sorted({1, min(2, most), most})]
+    threads = sorted({1, min(2, most), most})
     return [
-        *ours,
+        *(Candidate("cpu", n, cpu.make, repeats) for n in threads),
+        *(Candidate("cpu, depth", n, cpu.make_with_depth, repeats) for n in threads),
         Candidate("scalar", 1, scalar.make, 3),
         Candidate("torch", most, torch_tiles.make, 1),
         Candidate("gsplat torch", most, gsplat_torch.make, 1),

@@ -135,6 +135,7 @@ class GaussianMethod(SplattingMethod):
     def permute(self, order: NDArray[np.int64]) -> None:
         rows, parameters = torch.from_numpy(order), self.model.parameters
         self.model.parameters = {name: tensor[rows] for name, tensor in parameters.items()}
+        self.model.is_final = False
 
     def save(self, folder: Path) -> None:
         self.meta["sh_degree"] = self.model.sh_degree
@@ -153,6 +154,7 @@ class GaussianMethod(SplattingMethod):
             ) from error
         _check_groups(folder, tensors, self.shapes)
         self.model = self.restore_model(tensors)
+        self.model.is_final = True
 
 
 def _check_groups(

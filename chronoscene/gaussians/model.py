@@ -46,6 +46,10 @@ class GaussianModel:
     _: KW_ONLY
     sh_degree: int = 0
     """Degree of the spherical harmonics in use."""
+    is_final: bool = False
+    """True once nothing changes any more: the Gaussians of the latest period are then kept for the
+    next view."""
+    _latest: tuple[float, Mapping[str, Tensor]] | None = field(default=None, init=False)
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -64,7 +68,7 @@ class GaussianModel:
 
     def splats(self, view: View, period: float) -> Splats:
         """The Gaussians to draw in a view as of a period."""
-        p = self.at_period(period)
+        p = self._drawn_at(period)
         centre = camera_centre_tensor(view, p["means"].device)
         return Splats(
             means=p["means"],
@@ -73,6 +77,15 @@ class GaussianModel:
             opacities=opacities_of(p["logit_opacities"]),
             colors=evaluate(p["sh_dc"], p["sh_rest"], p["means"], centre, self.sh_degree),
         )
+
+    def _drawn_at(self, period: float) -> Mapping[str, Tensor]:
+        """`at_period`, computed once for consecutive views of a period if the model is final."""
+        if not self.is_final:
+            return self.at_period(period)
+        if self._latest is None or self._latest[0] != period:
+            self._latest = None  # Frees its memory first
+            self._latest = period, self.at_period(period)
+        return self._latest[1]
 
 
 def initialise(train: TrainingSet, *, opacity: float, scale: float = 1.0) -> dict[str, Tensor]:

@@ -162,3 +162,29 @@ def test_a_field_needs_no_trainer_of_its_own(tmp_path):
         mine, theirs = (m.render(scene.views[0], period).rgb for m in (method, loaded))
         assert np.array_equal(mine, theirs)
     assert loaded.size() == method.size()
+
+
+def test_a_stored_model_is_deformed_once_for_the_views_of_a_period(tmp_path, monkeypatch):
+    scene = toy_scene(colors_per_period=2)
+    method = train(scene, replace(SHORT, iterations=20), method_class=Painted)
+    method.model.shared["added_color"].data[1] += 0.5
+    method.save(tmp_path)
+    loaded = Painted(SHORT)
+    loaded.load(tmp_path, device="cpu")
+    views, expected = scene.views[:2], {}
+    for period in (0, 1):
+        expected[period] = [method.render(view, period).rgb for view in views]
+    assert np.abs(expected[0][0] - expected[1][0]).max() > 0.1
+    deformed, at_period = [], PaintedModel.at_period
+
+    def counted(model, period):
+        deformed.append(period)
+        return at_period(model, period)
+
+    monkeypatch.setattr(PaintedModel, "at_period", counted)
+    for period in (0, 1, 0):
+        for view, image in zip(views, expected[period], strict=True):
+            assert np.array_equal(loaded.render(view, period).rgb, image)
+    assert deformed == [0, 1, 0]
+    loaded.permute(np.arange(len(loaded.model))[::-1].copy())
+    np.testing.assert_allclose(loaded.render(views[0], 1).rgb, expected[1][0], atol=1e-4)

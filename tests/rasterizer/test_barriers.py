@@ -99,6 +99,8 @@ def _project_from(rendering: passes.Rendering) -> Callable[..., None]:
     ) -> None:  # fmt: skip
         first, last = chunk_range.py_func(chunk, chunks, COUNT)
         records[0].reshape(COUNT, -1)[first:last] = rows[first:last]
+        # Where depths are now.
+        records[1].reshape(COUNT, -1)[first:last, layout.ROW] = row_starts[first:last]
         keys[first:last] = rendering.keys[first:last]
         numbering[0][first:last] = row_starts[first:last]
         numbering[1][chunk + 1] = row_bases[chunk + 1] - row_bases[chunk]
@@ -164,3 +166,6 @@ def test_nobody_goes_on_before_a_phase_is_done(
     np.testing.assert_array_equal(tile_order, rendering.tiles[2])
     written = layout.ENTRY_BLOCKS * total
     np.testing.assert_array_equal(words[:written], rendering.entries[0][:written])
+    drawn = rendering.keys >= 0
+    depths = records.reshape(COUNT, -1)[drawn, layout.DEPTH]
+    np.testing.assert_array_equal(depths, launched.out[2][drawn])

@@ -23,3 +23,17 @@ def make(scene: Scene, backend: str = "cpu") -> Callable[[bool], Tensor]:
             backend=backend, check_finite=False,
         ).image,
     )  # fmt: skip
+
+
+def make_with_depth(scene: Scene) -> Callable[[bool], Tensor]:
+    """The same with the expected depth, whose gradient is the sum of those of the channels."""
+
+    def draw() -> Tensor:
+        drawn = rasterize(
+            *scene.gaussians, scene.viewmats, scene.Ks, scene.width, scene.height,
+            backend="cpu", render_depth=True, check_finite=False,
+        )  # fmt: skip
+        assert drawn.depths is not None
+        return drawn.image + drawn.depths
+
+    return by_autograd(scene, draw)

@@ -40,7 +40,7 @@ def rasterize(inputs: Inputs) -> Rasterization:
         )
     if means.dtype == torch.float64:
         means, viewmats = recentred(means, viewmats)
-    if colors.shape[1] != 3 or render_depth:  # the kernel sees three channels, if these are all
+    if colors.shape[1] != 3:  # the kernel sees three channels, if these are all
         colors, opacities = _without_bad_colors(colors, opacities)
     gaussians = _prepare(means, quats, scales, opacities, colors)
     count, padded, cameras = means.shape[0], gaussians[0].shape[0], viewmats.shape[0]
@@ -212,10 +212,7 @@ class DirectRender:
         view = make_view(inputs.viewmats[0].double().numpy(), inputs.Ks[0].double().numpy(), inputs)
         absgrad = None if self._absgrad is None else self._absgrad[0]
         request = Request(view, _flat(self.info, 0), inputs.render_depth, absgrad)
-        *shapes, opacities, colors = inputs.gaussians
-        if inputs.render_depth:
-            colors, opacities = _without_bad_colors(colors, opacities)
-        self._job = _Job((*shapes, opacities, colors), inputs.backgrounds[0], request)
+        self._job = _Job(inputs.gaussians, inputs.backgrounds[0], request)
         self._rendering, self.image, self.alpha, self.weighted = self._job.forward()
 
     def backward(
@@ -244,9 +241,8 @@ class _Job:
         self.means, self.quats, self.scales, self.opacities, self.colors = inputs
         self.request, self.view = request, request.view
         self.count, self.channels = self.colors.shape
-        self.total = self.channels + request.render_depth
-        self.groups = max(1, -(-self.total // 3))
-        self.direct = self.total == 3 and not request.render_depth
+        self.groups = max(1, -(-self.channels // 3))
+        self.direct = self.channels == 3
         self.background = np.zeros(3 * self.groups, np.float32)
         if background is not None:
             self.background[: self.channels] = background.detach().numpy()
@@ -257,16 +253,17 @@ class _Job:
         rendering.bin_gaussians(self._gaussians(), self.request.visible)
         images = torch.empty(self.groups, height, width, 3)
         alphas = torch.empty(height, width, 1)
+        weighted = torch.empty(height, width, 1) if self.request.render_depth else None
+        depth = None if weighted is None else weighted.numpy().reshape(-1)
         for group in range(self.groups):
             self._load_colors(rendering, group)
             image = images[group].numpy().reshape(-1)
-            rendering.composite(self._background(group), image, alphas.numpy().reshape(-1))
+            rendering.composite(self._background(group), image, alphas.numpy().reshape(-1), depth)
+            depth = None  # written once
         if self.direct:
-            return rendering, images[0], alphas, None
-        values = torch.cat(list(images), dim=-1)
-        weighted = values[..., self.channels : self.total].clone()
-        image_values = values[..., : self.channels].contiguous()
-        return rendering, image_values, alphas, weighted if self.request.render_depth else None
+            return rendering, images[0], alphas, weighted
+        values = torch.cat(list(images), dim=-1)[..., : self.channels].contiguous()
+        return rendering, values, alphas, weighted
 
     def backward(
         self,
@@ -281,18 +278,14 @@ class _Job:
             for k in (3, 4, 3, 1, 3, 2)
         )
         grads = tuple(x.numpy().reshape(-1) for x in outputs)
-        depth_grads = np.empty(0, np.float32)
         if self.direct:
-            summed: Any = self._sum_pixels(rendering, 0, image_grad, alpha_grad)
+            pixels = (image_grad, alpha_grad, weighted_grad)
+            summed: Any = self._sum_pixels(rendering, 0, *pixels)
             self._add_absolute(rendering, summed)
         else:
-            if weighted_grad is not None:
-                image_grad = torch.cat([image_grad, weighted_grad], dim=-1)
-            image_grad = pad(image_grad, (0, 3 * self.groups - image_grad.shape[-1]))
-            summed, values = self._sum_groups(rendering, image_grad, alpha_grad)
-            if self.request.render_depth:
-                depth_grads = values[:, self.channels].copy()
-        rendering.gaussian_gradients(self._gaussians(), summed, depth_grads, grads)
+            image_grad = pad(image_grad, (0, 3 * self.groups - self.channels))
+            summed, values = self._sum_groups(rendering, image_grad, alpha_grad, weighted_grad)
+        rendering.gaussian_gradients(self._gaussians(), summed, grads)
         means, quats, scales, opacities, colors, means2d = outputs
         if not self.direct:
             colors = torch.from_numpy(values[:, : self.channels].copy())
@@ -310,7 +303,11 @@ class _Job:
         absgrad += found * np.float32(layout.WHITEN**-2)
 
     def _sum_groups(
-        self, rendering: Rendering, image_grad: Tensor, alpha_grad: Tensor | None
+        self,
+        rendering: Rendering,
+        image_grad: Tensor,
+        alpha_grad: Tensor | None,
+        weighted_grad: Tensor | None,
     ) -> tuple[AnyArray, AnyArray]:
         """16 sums of each Gaussian over all groups, and the gradients of all channels."""
         sums = np.zeros((self.count, 16), np.float32)
@@ -318,19 +315,24 @@ class _Job:
         for group in range(self.groups):
             self._load_colors(rendering, group)
             part = image_grad[..., 3 * group : 3 * group + 3]
-            rendering.sum_rows(
-                *self._sum_pixels(rendering, group, part, alpha_grad), sums.reshape(-1)
-            )
+            pixels = (part, alpha_grad, weighted_grad)
+            rendering.sum_rows(*self._sum_pixels(rendering, group, *pixels), sums.reshape(-1))
             values[:, 3 * group : 3 * group + 3] = sums[:, 6:9]
             sums[:, 6:9] = 0
-            alpha_grad = None  # counted once
+            alpha_grad = weighted_grad = None  # counted once
         return sums.reshape(-1), values
 
     def _sum_pixels(
-        self, rendering: Rendering, group: int, image_grad: Tensor, alpha_grad: Tensor | None
+        self,
+        rendering: Rendering,
+        group: int,
+        image_grad: Tensor,
+        alpha_grad: Tensor | None,
+        weighted_grad: Tensor | None,
     ) -> tuple[AnyArray, AnyArray]:
         alpha = torch.empty(0) if alpha_grad is None else alpha_grad
-        grads = (x.contiguous().numpy().reshape(-1) for x in (image_grad, alpha))
+        given = (image_grad, alpha) if weighted_grad is None else (image_grad, alpha, weighted_grad)
+        grads = (x.contiguous().numpy().reshape(-1) for x in given)
         wants_absolute = self.request.absgrad is not None
         return rendering.composite_backward(self._background(group), *grads, absgrad=wants_absolute)
 
@@ -348,9 +350,5 @@ class _Job:
         """Put the channels of a group into the records, unless they are there."""
         if self.direct:
             return
-        values = self.colors.detach()
-        if self.request.render_depth:
-            depths = torch.from_numpy(self.request.visible[2])
-            values = torch.cat([values, depths[:, None]], dim=1)
-        flat = values.contiguous().numpy().reshape(-1)
-        set_colors(flat, self.total, 3 * group, rendering.records)
+        flat = self.colors.detach().contiguous().numpy().reshape(-1)
+        set_colors(flat, self.channels, 3 * group, rendering.records)

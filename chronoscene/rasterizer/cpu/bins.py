@@ -77,10 +77,11 @@ def _tile_blocks(first: Any, last: Any, tile_x: int) -> Any:
 def _list_part(first, last, at, limit, order, view, scene, counts, listed):
     """Pairs of the Gaussians first..last of the order of drawing. Returns the list's end.
 
-    If the list is too short for them, its end is beyond ``limit``.
+    If the list is too short for them, its end is beyond ``limit``. What is sorted begins with how
+    far the bits of the depth are above those of the nearest Gaussian.
     """
     width, tiles_x = view
-    records, records_int, row_bases = scene
+    records, records_int, row_bases, nearest = scene
     list_tile, (list_blocks, list_numbers) = listed
     counts[:] = 0
     for i in range(first, last):
@@ -107,6 +108,7 @@ def _list_part(first, last, at, limit, order, view, scene, counts, listed):
                     counts[tile] += 1
                     at += 1
                     row += 1
+        records_int[base + layout.DEPTH] = nearest + (order[i] >> 32)
     return at
 
 
@@ -225,7 +227,7 @@ def bin_gaussians(
 
     starts, ends = parts
     counts, tile_starts, tile_order, listed, entries = tiles
-    scene = (records[0], records[1], row_bases)
+    scene = (records[0], records[1], row_bases, result[1])
     if not _list_phase(
         control, phase, starts, ends, order, result[0], (width, tiles_x), scene, counts, listed
     ):

@@ -31,7 +31,7 @@ from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, spl
 
 AHEAD = 12  # Entries by which records are asked for in advance
 STEPS = 32  # Scratch numbers of a Gaussian in a tile, see `start_gaussian`
-_STATE = 64  # Numbers per block: light, red, green, blue
+_STATE = 80  # Numbers per block: light, red, green, blue, depth
 _STEPS = 64 * _STATE  # Where the steps are
 FORWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 
@@ -121,7 +121,7 @@ def _start_tile(left, top, width, height, state, planes, plane, end):
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
         at = _STATE * block
-        state[at + 16 : at + 64] = np.float32(0.0)
+        state[at + 16 : at + _STATE] = np.float32(0.0)
         kept = plane + 16 * block
         if x + 4 <= width and y + 4 <= height:
             state[at : at + 16] = np.float32(1.0)
@@ -161,8 +161,10 @@ def _light_left(alpha: Any, light: Any) -> Any:
 
 
 @inner(fast_math=True)
-def _forward_tile(start, end, left, top, active, plane, entries, records, planes, state):
+def _forward_tile(depth, start, end, left, top, active, plane, entries, records, planes, state):
     """Composite the entries of a tile: C += alpha T c, T *= 1 - alpha. Returns where it stopped.
+
+    The type of ``depth`` says if that is a channel, too.
 
     A finished pixel has light 0 here, so that nothing adds to it; what light it had is kept in the
     planes, with the entry before which it ended. That happens once per pixel: the branch is rare,
@@ -182,6 +184,7 @@ def _forward_tile(start, end, left, top, active, plane, entries, records, planes
         record = layout.RECORD * gaussian_of(numbers, entry)
         gaussian = start_gaussian(records, record, left, top, state, _STEPS)
         red, green, blue = color_of(records, record)
+        z = splat(records[record + layout.DEPTH])
         while bits != 0:
             block = trailing_zeros(bits)
             bits &= bits - np.uint64(1)
@@ -207,12 +210,16 @@ def _forward_tile(start, end, left, top, active, plane, entries, records, planes
                 store(state, at + 16, load(state, at + 16) + weight * red)
                 store(state, at + 32, load(state, at + 32) + weight * green)
                 store(state, at + 48, load(state, at + 48) + weight * blue)
+                if len(depth) > 0:
+                    store(state, at + 64, load(state, at + 64) + weight * z)
     return end
 
 
 @inner(fast_math=True)
-def _write_tile(left, top, width, height, plane, state, transmittance, background, image, alphas):
-    """Image C + T b over the background b, and opacity 1 - T, from a tile's state."""
+def _write_tile(
+    left, top, width, height, plane, state, transmittance, background, image, alphas, depth
+):
+    """Image C + T b over the background b, opacity 1 - T, and depth, from a tile's state."""
     red, green, blue = background
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
@@ -232,6 +239,8 @@ def _write_tile(left, top, width, height, plane, state, transmittance, backgroun
                 channels = (load(state, i + 16), load(state, i + 32), load(state, i + 48))
                 store_pixels(image, 3 * pixel, 3 * width, channels)
                 store_pixels(alphas, pixel, width, (1.0 - load(state, i),))
+                if len(depth) > 0:
+                    store_pixels(depth[0], pixel, width, (load(state, i + 64),))
         else:
             for k in range(16):
                 if x + k % 4 < width and y + k // 4 < height:
@@ -239,11 +248,13 @@ def _write_tile(left, top, width, height, plane, state, transmittance, backgroun
                     alphas[pixel] = np.float32(1.0) - state[at + k]
                     for c in range(3):
                         image[3 * pixel + c] = state[at + 16 + 16 * c + k]
+                    if len(depth) > 0:
+                        depth[0][pixel] = state[at + 64 + k]
 
 
 @kernel(fast_math=True, extras=[constants])
 def composite(
-    worker, control, size, tiles, entries, records, planes, states, background, image, alphas
+    worker, control, size, tiles, entries, records, planes, states, background, image, alphas, depth
 ):
     """Composite all tiles.
 
@@ -259,6 +270,7 @@ def composite(
         states: Scratch, `FORWARD_NUMBERS` per worker.
         background: Three numbers.
         image, alphas: Written. [H * W * 3], [H * W]
+        depth: A tuple: nothing, or where the depth times the opacity is written. [H * W]
     """
     width, height = size
     starts, stops, order = tiles
@@ -271,8 +283,8 @@ def composite(
         active = _start_tile(left, top, width, height, state, planes, plane, end)
         x, y = np.float32(left), np.float32(top)
         stops[tile] = _forward_tile(
-            start, end, x, y, active, plane, entries, records, planes, state
+            depth, start, end, x, y, active, plane, entries, records, planes, state
         )
         light = (background[0], background[1], background[2])
-        _write_tile(left, top, width, height, plane, state, planes[0], light, image, alphas)
+        _write_tile(left, top, width, height, plane, state, planes[0], light, image, alphas, depth)
         job = draw(control, 0)

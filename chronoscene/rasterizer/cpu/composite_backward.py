@@ -26,11 +26,12 @@ from chronoscene.rasterizer.cpu.composite import (
 )
 from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, splat, splat_int
 
-_STATE = 96  # Numbers per block: light, behind, gradient of red, green, blue, end of what counts
+_STATE = 112  # Numbers per block: light, behind, gradients of red, green, blue, the end of what
+# counts, gradient of the depth
 _STEPS = 64 * _STATE  # Where the steps are
 BACKWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 
-_load_rgb, _load_alpha = make_load_pixels(3, LANES), make_load_pixels(1, LANES)
+_load_rgb, _load_plane = make_load_pixels(3, LANES), make_load_pixels(1, LANES)
 
 
 @inlined
@@ -40,12 +41,11 @@ def _place_of(numbers: Any, entry: Any) -> Any:
 
 
 @inner(fast_math=True)
-def _start_backward(
-    left, top, width, height, plane, planes, image_grad, alpha_grad, background, state
-):
+def _start_backward(left, top, width, height, plane, planes, grads, depth_grad, background, state):
     """State of a tile: final light, gradients g of the channels, and what is behind the last
     Gaussian, B = b . g - d loss / d opacity with b the background."""
     transmittance, last = planes
+    image_grad, alpha_grad = grads
     red, green, blue = background
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
@@ -61,19 +61,24 @@ def _start_backward(
                 store(state, i + 64, b)
                 behind = r * red + (g * green + b * blue)
                 if alpha_grad.size > 0:
-                    behind = behind - _load_alpha(alpha_grad, pixel, width)[0]
+                    behind = behind - _load_plane(alpha_grad, pixel, width)[0]
                 store(state, i + 16, behind)
+                if len(depth_grad) > 0:
+                    store(state, i + 96, _load_plane(depth_grad[0], pixel, width)[0])
         else:
             for k in range(16):
-                r = g = b = a = np.float32(0.0)
+                r = g = b = a = z = np.float32(0.0)
                 if x + k % 4 < width and y + k // 4 < height:
                     pixel = (y + k // 4) * width + x + k % 4
                     r, g = image_grad[3 * pixel], image_grad[3 * pixel + 1]
                     b = image_grad[3 * pixel + 2]
                     if alpha_grad.size > 0:
                         a = alpha_grad[pixel]
+                    if len(depth_grad) > 0:
+                        z = depth_grad[0][pixel]
                 state[at + 32 + k], state[at + 48 + k], state[at + 64 + k] = r, g, b
                 state[at + 16 + k] = r * red + g * green + b * blue - a
+                state[at + 96 + k] = z
         for part in range(PARTS):
             i, k = at + LANES * part, plane + 16 * block + LANES * part
             store(state, i, load(transmittance, k))
@@ -81,12 +86,14 @@ def _start_backward(
 
 
 @inner(fast_math=True)
-def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, rows, state):
+def _backward_tile(
+    absgrad, depth_grad, start, stop, left, top, entries, records, touched, rows, state
+):
     """Rows of the entries of a tile, from the last to the first.
 
     With T the light before a Gaussian and B the gradient-weighted colour behind it as seen with
     unit light: d loss / d alpha = T (c . grad - B); behind the next one in front,
-    B' = B + alpha (c . grad - B). The type of ``absgrad`` says what is compiled.
+    B' = B + alpha (c . grad - B). The types of ``absgrad`` and ``depth_grad`` say what is compiled.
     """
     blocks, numbers = entries
     for k in range(stop - start):
@@ -100,7 +107,8 @@ def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, r
         record = layout.RECORD * gaussian_of(numbers, entry)
         gaussian = start_gaussian(records, record, left, top, state, _STEPS)
         red, green, blue = color_of(records, record)
-        s = su = sv = suu = suv = svv = sr = sg = sb = splat(np.float32(0.0))
+        z = splat(records[record + layout.DEPTH])
+        s = su = sv = suu = suv = svv = sr = sg = sb = sz = splat(np.float32(0.0))
         sx, sy, slope = s, s, slopes(records, record)
         number = splat_int(entry)
         while bits != 0:
@@ -117,6 +125,9 @@ def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, r
                 behind = load(state, at + 16)
                 gr, gg, gb = load(state, at + 32), load(state, at + 48), load(state, at + 64)
                 difference = gr * red + (gg * green + (gb * blue - behind))
+                if len(depth_grad) > 0:
+                    gz = load(state, at + 96)
+                    difference = difference + gz * z
                 weight = alpha * light
                 step = alpha * difference
                 store(state, at, light)
@@ -125,6 +136,8 @@ def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, r
                 sr = sr + weight * gr
                 sg = sg + weight * gg
                 sb = sb + weight * gb
+                if len(depth_grad) > 0:
+                    sz = sz + weight * gz
                 # g = alpha d loss / d alpha, 0 where alpha is capped; its moments in (u, v).
                 g = select(raw <= constants.ALPHA_MAX, step * light, 0.0)
                 gu, gv = g * u, g * v
@@ -139,7 +152,7 @@ def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, r
                     sy = sy + absolute(gu * slope[1] + gv * slope[3])
         place = _place_of(numbers, entry)
         touched[place] = 1
-        store_sums(rows, layout.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
+        store_sums(rows, layout.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb, sz))
         rows[layout.RECORD * place + layout.SUM_SIGN] = records[record + layout.V]
         if len(absgrad) > 0:
             store_sums(state, _STEPS, (sx, sy))
@@ -149,15 +162,28 @@ def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, r
 
 @kernel(fast_math=True, extras=[constants])
 def composite_backward(
-    worker, control, size, tiles, entries, records, planes, states, background, grads, absgrad, out
+    worker,
+    control,
+    size,
+    tiles,
+    entries,
+    records,
+    planes,
+    states,
+    background,
+    grads,
+    depth_grad,
+    absgrad,
+    out,
 ):
-    """Sums over pixels of every entry, from the gradients of image and opacity.
+    """Sums over pixels of every entry, from the gradients of image, opacity and depth.
 
     Args:
         worker, control, size, background: As in `composite`.
         tiles, entries, records, planes: As `composite` left them.
         states: Scratch, `BACKWARD_NUMBERS` per worker.
         grads: Of image and opacity. [H * W * 3], [H * W] or nothing
+        depth_grad: A tuple: nothing, or the gradient of the depth times the opacity. [H * W]
         absgrad: A tuple; unless it is empty, rows have absolute gradients too.
         out: (touched, rows), written. Where touched, zeros at first, becomes 1, there is a row of
             16 numbers, see `layout`. uint8, float32
@@ -171,8 +197,10 @@ def composite_backward(
         tile = order[job]
         left, top = tile_corner(tile, width)
         plane, light = layout.TILE_PIXELS * tile, (background[0], background[1], background[2])
-        _start_backward(left, top, width, height, plane, planes, grads[0], grads[1], light, state)
+        _start_backward(left, top, width, height, plane, planes, grads, depth_grad, light, state)
         x, y = np.float32(left), np.float32(top)
         first, last = starts[tile], stops[tile]
-        _backward_tile(absgrad, first, last, x, y, entries, records, touched, rows, state)
+        _backward_tile(
+            absgrad, depth_grad, first, last, x, y, entries, records, touched, rows, state
+        )
         job = draw(control, 0)

@@ -43,15 +43,17 @@ COLOR = 6  # Three numbers
 SHEAR, HALF_WIDTH, RIGHTMOST = 9, 10, 11  # See bins.py
 TILES_X, TILES_Y = 12, 13  # int: first tile + (number of tiles << 16), per axis
 ROW = 14  # int: first row of sums in the backward pass, counted from that of the chunk
+DEPTH = 14  # In the place of the row, once the tiles of the Gaussian are listed: its z-depth
 INVERSE_Y = 15  # WHITEN over the standard deviation of y
 
 # One row of sums over the pixels of a tile, for a (Gaussian, tile) pair. With
 # g = alpha * d loss / d alpha: sums of g, g u, g v, g u^2, g u v, g v^2, and of the weight times
-# the gradient of each channel; the sign of V, so that both passes agree on it; and, if asked for,
-# of |g (u U_X + v V_X)| and |g (u U_Y + v V_Y)|, where v = V_X dx + V_Y dy.
+# the gradient of each channel and of the depth; the sign of V, so that both passes agree on it;
+# and, if asked for, of |g (u U_X + v V_X)| and |g (u U_Y + v V_Y)|, where v = V_X dx + V_Y dy.
 SUM, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_COLOR = 0, 1, 2, 3, 4, 5, 6
-SUM_SIGN = 9
-SUM_ABSOLUTE = 10  # Two numbers
+SUM_DEPTH = 9  # 0 without depth
+SUM_SIGN = 10
+SUM_ABSOLUTE = 11  # Two numbers
 
 # An entry is a (Gaussian, tile) pair in 16 bytes, so that sorting moves one piece of memory: the
 # blocks as one 64-bit number, then two of 32 bits, the Gaussian and its row of sums.

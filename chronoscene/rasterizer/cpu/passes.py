@@ -170,12 +170,21 @@ class Rendering:
         frame = (size, self.tiles, self.entries, self.records, self.planes)
         launch(kernel, self.view.tiles, *frame, states, *args)
 
-    def composite(self, background: AnyArray, image: AnyArray, alphas: AnyArray) -> None:
-        """Composite the three channels in the records."""
-        self._launch_tiles(composite, ("forward", FORWARD_NUMBERS), background, image, alphas)
+    def composite(
+        self, background: AnyArray, image: AnyArray, alphas: AnyArray, depth: AnyArray | None = None
+    ) -> None:
+        """Composite the three channels in the records, and the depth where it is to be written."""
+        written = (image, alphas, () if depth is None else (depth,))
+        self._launch_tiles(composite, ("forward", FORWARD_NUMBERS), background, *written)
 
     def composite_backward(
-        self, background: AnyArray, image_grad: AnyArray, alpha_grad: AnyArray, *, absgrad: bool
+        self,
+        background: AnyArray,
+        image_grad: AnyArray,
+        alpha_grad: AnyArray,
+        depth_grad: AnyArray | None = None,
+        *,
+        absgrad: bool,
     ) -> tuple[AnyArray, AnyArray]:
         """Sums over pixels by entry: (touched, rows); of absolute gradients too if asked for."""
         count = int(self.numbering[1][-1])
@@ -185,8 +194,8 @@ class Rendering:
         touched[:] = 0
         scratch = ("backward", BACKWARD_NUMBERS)
         grads, out = (image_grad, alpha_grad), (touched, rows)
-        options = (1,) if absgrad else ()
-        self._launch_tiles(composite_backward, scratch, background, grads, options, out)
+        options = (() if depth_grad is None else (depth_grad,), (1,) if absgrad else ())
+        self._launch_tiles(composite_backward, scratch, background, grads, *options, out)
         return touched, rows
 
     def transmittance(self) -> AnyArray:
@@ -206,7 +215,6 @@ class Rendering:
         self,
         gaussians: Gaussians,
         summed: tuple[AnyArray, AnyArray] | AnyArray,
-        depth_gradients: AnyArray,
         grads: tuple[AnyArray, ...],
     ) -> None:
         """Gradients of the inputs, written to ``grads``, from what was summed over pixels.
@@ -214,7 +222,6 @@ class Rendering:
         Args:
             gaussians: As in the forward pass.
             summed: (touched, rows) of one rendering, or 16 numbers of each Gaussian.
-            depth_gradients: d loss / d z-depth of each Gaussian, or nothing.
             grads: Of means, quats, scales, opacities, colors and means2d.
         """
         if isinstance(summed, tuple):
@@ -226,7 +233,6 @@ class Rendering:
             project_backward,
             self.numbering[1].size - 1,
             gaussians,
-            depth_gradients,
             self.view.camera,
             self.keys,
             self.numbering,

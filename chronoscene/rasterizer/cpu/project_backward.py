@@ -112,7 +112,7 @@ def _keep(mask: Any, values: Any) -> Any:
 
 
 @inlined
-def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys, grads):
+def _backward_group(at, sums, sums_at, gaussians, camera, keys, grads):
     """Gradients of Gaussians at..at+LANES from their sums over pixels."""
     means, quats, scales, opacities, _ = gaussians
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_means2d = grads
@@ -171,8 +171,7 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     gpx = rz * (camera[layout.FX] * gmx - gjx)
     gpy = rz * (camera[layout.FY] * gmy - gjy)
     gpz = zero - tx * gpx - ty * gpy - rz * turning
-    if depth_gradients.size > 0:
-        gpz = gpz + load(depth_gradients, at)
+    gpz = gpz + f[layout.SUM_DEPTH]
 
     # d loss / d R = rotation^T (d0, d1, d2).
     dr = (
@@ -210,14 +209,13 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
 
 @kernel(fast_math=True, extras=[constants])
 def project_backward(
-    worker, control, gaussians, depth_gradients, camera, keys, numbering, touched, rows, sums, grads
+    worker, control, gaussians, camera, keys, numbering, touched, rows, sums, grads
 ):
     """Reduce the rows of all Gaussians in fixed order and turn them into gradients.
 
     Args:
         worker, control: See `thread_pool.launch`; a job is a chunk of Gaussians.
         gaussians, camera, keys: As in `project_chunk`.
-        depth_gradients: d loss / d z-depth that did not come through the projection; or nothing.
         numbering: (first row of each Gaussian in its chunk, first row of each chunk and the end).
         touched: Whether a row was written.
         rows: Sums over the pixels of a tile. Without any, ``sums`` are taken as they are.
@@ -238,5 +236,5 @@ def project_backward(
                     row, end = _rows_of(at + lane, last, chunk, numbering)
                     total = _sum_rows(row, end, touched, rows, _splat_row(0.0))
                     store(sums, place + layout.RECORD * lane, total)
-            _backward_group(at, sums, place, gaussians, depth_gradients, camera, keys, grads)
+            _backward_group(at, sums, place, gaussians, camera, keys, grads)
         chunk = draw(control, 0)
