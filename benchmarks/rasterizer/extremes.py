@@ -55,7 +55,7 @@ def measured() -> str:
             continue
         compared = comparison.compare(extreme.build(), truth=extreme.truth and extreme.truth())
         errors = errors_of(compared)
-        moved = errors_of(comparison.rounding(compared.scene, fixed=extreme.fixed))
+        moved = errors_of(comparison.rounding(compared, fixed=extreme.fixed))
         left_out = 100 * (1 - compared.steady.mean())
         cells = [*(errors[c] for c in columns), moved["image"], moved["gradients"]]
         rows.append([extreme.name, *map(number, cells), f"{left_out:.1f}"])
