@@ -131,7 +131,7 @@ class Stages:
         lap("composite")
         summed = rendering.composite_backward(background, self.image_grad, nothing, absgrad=False)
         lap("composite, backward")
-        rendering.gaussian_gradients(self.gaussians, summed, nothing, self.grads)
+        rendering.gaussian_gradients(self.gaussians, summed, self.grads)
         lap("project, backward")
         return times, work_of(rendering)
 
