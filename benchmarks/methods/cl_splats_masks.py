@@ -40,25 +40,25 @@ def look(method: CLSplats, part: Part, scene: Scene, out: Path) -> list[float]:
         photo, counts = part.store.load(frame), part.store.load_mask(frame)
         image = method.render(part.view(frame), part.last - 1.0).rgb
         found = change_scores(image, photo, counts)
-        mask = change_mask(found, method.config)
+        changed = change_mask(found, method.config)
         path = (out / frame.name).with_suffix(".png")
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encode_png(np.repeat(255 * mask[..., None].astype(np.uint8), 3, 2)))
+        path.write_bytes(encode_png(np.repeat(255 * changed[..., None].astype(np.uint8), 3, 2)))
         truth = scene.root / "gt" / truth_place("change", frame.name, part.last - 1)
         if truth.is_file():
-            counted = np.ones_like(mask) if counts is None else counts
+            counted = np.ones_like(changed) if counts is None else counts
             size = part.store.camera(frame).size
             truths.append(load_changes(truth, size, MAX_WIDTH)[counted])
             scores.append(found[counted])
-            masks.append(mask[counted])
+            masks.append(changed[counted])
     if not truths:
         return []
-    truth, mask = np.concatenate(truths), np.concatenate(masks)
-    values = score(np.concatenate(scores), truth)
-    values |= {k: v for k, v in score(mask, truth, threshold=1).items() if "_ap" not in k}
+    changes, marked = np.concatenate(truths), np.concatenate(masks)
+    values = score(np.concatenate(scores), changes)
+    values |= {k: v for k, v in score(marked, changes, threshold=1).items() if "_ap" not in k}
     names = ("ap", "ap_geometry", "ap_appearance", "f1", "iou")
     columns = [values.get(f"change_{name}", np.nan) for name in names]
-    return [float((truth != UNCHANGED).mean()), float(mask.mean()), *columns]
+    return [float((changes != UNCHANGED).mean()), float(marked.mean()), *columns]
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ SIZES = ((20_000, 256, 256), (100_000, 400, 300), (200_000, 800, 600), (1_000_00
 class Scene:
     """Arguments of one rendering, and the gradient that comes back from a loss."""
 
-    gaussians: tuple[Tensor, ...]
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
     """means, quats, scales, opacities, colors"""
     viewmats: Tensor
     Ks: Tensor
