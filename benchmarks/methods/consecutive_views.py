@@ -2,9 +2,9 @@
 
     python -m benchmarks.methods.consecutive_views RUN... [--threads 1] [--rounds 5]
 
-RUN is the folder of a seed of a method with explicit Gaussians. All views of a period are drawn
-before those of the next, as evaluation does; a round draws all of them both ways, in turns. Prints
-medians over rounds of the mean over the views, and their ratio.
+RUN is the folder of a seed of a method with explicit Gaussians, with one model. All views of a
+period are drawn before those of the next, as evaluation does; a round draws all of them both ways,
+in turns. Prints medians over rounds of the mean over the views, and their ratio.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ChronoSceneError, ConfigError
 from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.harness.files.provenance import code_version, processor_name
 from chronoscene.harness.use.trained_run import open_run
@@ -40,6 +40,7 @@ def measure(folder: Path, rounds: int) -> tuple[int, float, float]:
             todo="give a run of 3dgs, 4dgs, realtime4dgs or cl-splats",
         )
     views = run.frame_views(scene, frames)
+    method.render(views[0], frames[0].period)  # Compile, touch memory.
     spent: dict[bool, list[float]] = {True: [], False: []}
     for _ in range(rounds):
         for kept, times in spent.items():
@@ -62,7 +63,10 @@ def main() -> None:
     set_threads(args.threads)
     print(f"{processor_name()}, {args.threads} thread(s), commit {code_version()}")
     for folder in args.runs:
-        count, once, anew = measure(folder, args.rounds)
+        try:
+            count, once, anew = measure(folder, args.rounds)
+        except ChronoSceneError as error:
+            parser.error(str(error))
         print(f"{folder}: {count} Gaussians, once {once:.1f} ms, anew {anew:.1f} ms", end="")
         print(f", ratio {anew / once:.2f}")
 

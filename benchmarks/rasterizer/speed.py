@@ -17,6 +17,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -73,10 +74,10 @@ class Row:
 def candidates(repeats: int) -> list[Candidate]:
     """Ours with one thread, two and all; then the others."""
     most = available_threads()
-    threads = sorted({1, min(2, most), most})
+    threads, with_depth = sorted({1, min(2, most), most}), partial(cpu.make, render_depth=True)
     return [
         *(Candidate("cpu", n, cpu.make, repeats) for n in threads),
-        *(Candidate("cpu, depth", n, cpu.make_with_depth, repeats) for n in threads),
+        *(Candidate("cpu, depth", n, with_depth, repeats) for n in threads),
         Candidate("scalar", 1, scalar.make, 3),
         Candidate("torch", most, torch_tiles.make, 1),
         Candidate("gsplat torch", most, gsplat_torch.make, 1),

@@ -14,26 +14,19 @@ NAME = "cpu"
 WHAT = "backend cpu (this package)"
 
 
-def make(scene: Scene, backend: str = "cpu") -> Callable[[bool], Tensor]:
-    """Rendering of a scene, as a method calls it: checks off, new output tensors every time."""
-    return by_autograd(
-        scene,
-        lambda: rasterize(
-            *scene.gaussians, scene.viewmats, scene.Ks, scene.width, scene.height,
-            backend=backend, check_finite=False,
-        ).image,
-    )  # fmt: skip
+def make(
+    scene: Scene, backend: str = "cpu", *, render_depth: bool = False
+) -> Callable[[bool], Tensor]:
+    """Rendering of a scene, as a method calls it: checks off, new output tensors every time.
 
-
-def make_with_depth(scene: Scene) -> Callable[[bool], Tensor]:
-    """The same with the expected depth, whose gradient is the sum of those of the channels."""
+    With depth, its gradient is the sum of those of the channels.
+    """
 
     def draw() -> Tensor:
         drawn = rasterize(
             *scene.gaussians, scene.viewmats, scene.Ks, scene.width, scene.height,
-            backend="cpu", render_depth=True, check_finite=False,
+            backend=backend, render_depth=render_depth, check_finite=False,
         )  # fmt: skip
-        assert drawn.depths is not None
-        return drawn.image + drawn.depths
+        return drawn.image if drawn.depths is None else drawn.image + drawn.depths
 
     return by_autograd(scene, draw)

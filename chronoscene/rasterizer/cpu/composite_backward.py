@@ -26,8 +26,9 @@ from chronoscene.rasterizer.cpu.composite import (
 )
 from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, splat, splat_int
 
-_STATE = 112  # Numbers per block: light, behind, gradients of red, green, blue, the end of what
-# counts, gradient of the depth
+# Numbers per block: light, behind, gradients of red, green, blue, the end of what counts, gradient
+# of the depth.
+_STATE = 112
 _STEPS = 64 * _STATE  # Where the steps are
 BACKWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 

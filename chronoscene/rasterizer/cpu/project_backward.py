@@ -170,8 +170,7 @@ def _backward_group(at, sums, sums_at, gaussians, camera, keys, grads):
     # d loss / d p, with p the centre in the camera's frame.
     gpx = rz * (camera[layout.FX] * gmx - gjx)
     gpy = rz * (camera[layout.FY] * gmy - gjy)
-    gpz = zero - tx * gpx - ty * gpy - rz * turning
-    gpz = gpz + f[layout.SUM_DEPTH]
+    gpz = zero - tx * gpx - ty * gpy - rz * turning + f[layout.SUM_DEPTH]
 
     # d loss / d R = rotation^T (d0, d1, d2).
     dr = (
