@@ -219,6 +219,7 @@ def bench(
     overrides: Mapping[str, object] | None = None,
     max_width: int = MAX_WIDTH,
     validation: bool = False,
+    validation_seed: int = 0,
     fit_half: bool = False,
     device: str = "auto",
     threads: int | None = None,
@@ -248,6 +249,7 @@ def bench(
         overrides: Options of the methods: ``key`` for all methods, ``method.key`` for one.
         max_width: Wider images are scaled down to this width in pixels.
         validation: Hold blocks of the training views back and score these; test views are not read.
+        validation_seed: Seed of the choice of these blocks.
         fit_half: Fit the appearance of each test view to the left half of its photo, and score the
             right half.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -292,6 +294,7 @@ def bench(
         budget_seconds=parse_duration(budget, "budget") if isinstance(budget, str) else budget,
         max_width=max_width,
         validation=validation,
+        validation_seed=validation_seed,
         fit_half=fit_half,
         threads=threads,
         device=device,

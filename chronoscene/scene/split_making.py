@@ -128,7 +128,7 @@ def make_split(scene: Scene, settings: SplitSettings, times: Times | None = None
     )
 
 
-def hold_out_validation(scene: Scene) -> Scene:
+def hold_out_validation(scene: Scene, seed: int = 0) -> Scene:
     """Hold blocks of the training views back, as test views of a scene without the true ones.
 
     Test views are left out with all that depends on them: masks, observations, and points that no
@@ -136,6 +136,7 @@ def hold_out_validation(scene: Scene) -> Scene:
 
     Args:
         scene: Its images are not opened.
+        seed: Of the choice of blocks.
 
     Returns:
         The scene of the training views. Whole blocks of them, as ``blocked`` chooses by default,
@@ -164,7 +165,7 @@ def hold_out_validation(scene: Scene) -> Scene:
     )
     blocks = min(len(frames), round(2 / FRACTION))
     try:
-        split = make_split(whole, SplitSettings("blocked", seed=0, blocks=blocks)).scene
+        split = make_split(whole, SplitSettings("blocked", seed=seed, blocks=blocks)).scene
     except ConfigError as error:
         raise SceneError(
             f"{scene.root}: validation",

@@ -296,8 +296,9 @@ def observed(scene):
 @given(
     st.lists(st.tuples(st.integers(0, 2), st.booleans()), max_size=40),
     st.lists(st.lists(st.integers(0, 48), unique=True, max_size=6), max_size=12),
+    st.integers(0, 3),
 )
-def test_validation_knows_the_training_views_alone(drawn, tracks):
+def test_validation_knows_the_training_views_alone(drawn, tracks, seed):
     """Whole blocks of them are scored, and nothing of the test views is left."""
     drawn = [*((p, False) for p in (0, 1, 2) * 2), *drawn]
     rng = np.random.default_rng(len(drawn))
@@ -319,7 +320,7 @@ def test_validation_knows_the_training_views_alone(drawn, tracks):
     )
     masks = {f.name: scene.images_root for f in frames[::2]}
     scene = replace(scene.with_frames(frames), points=points, masks=masks)
-    found = hold_out_validation(scene)
+    found = hold_out_validation(scene, seed)
 
     names = {f.name for f in scene.select(split="train")}
     assert [f.name for f in found.frames] == sorted(names)

@@ -119,6 +119,12 @@ MEMORY = click.option(
     "For choosing options.",
 )
 @click.option(
+    "--validation-seed",
+    type=click.IntRange(min=0),
+    default=0,
+    help="Seed of the choice of these blocks: others for a score on other views.",
+)
+@click.option(
     "--fit-half",
     is_flag=True,
     help="Fit the appearance of each test view to the left half of its photo, as the paper of "

@@ -25,6 +25,13 @@ from chronoscene.io.tables import boxed_text
     required=True,
     help="Number of trials in all, failed ones among them.",
 )
+@click.option(
+    "--splits",
+    type=click.IntRange(min=1),
+    default=1,
+    help="Number of choices of validation views: each trial trains each scene as often, and its "
+    "score is the mean.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of search and trainings.")
 @click.option(
     "--strategy",
@@ -36,7 +43,13 @@ from chronoscene.io.tables import boxed_text
 @MEMORY
 @click.option("--out", type=FOLDER, required=True, help="Folder for the search.")
 def command(
-    method: str, trials: int, seed: int, strategy: str | None, out: Path, **options: Any
+    method: str,
+    trials: int,
+    splits: int,
+    seed: int,
+    strategy: str | None,
+    out: Path,
+    **options: Any,
 ) -> None:
     """Search for options by scores on validation views.
 
@@ -54,6 +67,6 @@ def command(
         assignments=(),
         **options,
     )
-    results = tune(settings, trials, say)
+    results = tune(settings, trials, say, splits=splits)
     emit(boxed_text(trials_table(results), width=terminal_width()))
     report_written(out / PRESET_FILE, out / TRIALS_FILE)

@@ -10,7 +10,14 @@ from chronoscene.harness.files.records import variant_options
 from chronoscene.methods import installed_methods, load_spec
 from chronoscene.methods.preset_files import SUFFIX
 
-OPTIONS = ("iterations", "budget", "separate_iterations", "max_width", "protocol")
+OPTIONS = (
+    "iterations",
+    "budget",
+    "separate_iterations",
+    "max_width",
+    "validation_seed",
+    "protocol",
+)
 """Names in a variant that are options of ``bench``, not of the method."""
 FLAGS = ("validation", "fit_half")
 """Names of options without a value, likewise."""

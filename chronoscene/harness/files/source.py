@@ -31,7 +31,8 @@ class RunOrigin(BaseModel):
     period_by: str | None = None
     """Rule by which the images are grouped into periods, as for `read_scene`."""
     validation: bool = False
-    """Argument of `read_bench_scene`, as the next one."""
+    """Argument of `read_bench_scene`, as the next two."""
+    validation_seed: int = 0
     shrink: int = 1
 
     def read_scene(self, root: Path | None = None) -> Scene:
@@ -42,7 +43,12 @@ class RunOrigin(BaseModel):
         """
         place = root or Path(self.scene_root)
         found = detect(place, format=self.scene_format, period_by=self.period_by)
-        return read_bench_scene(found, validation=self.validation, shrink=self.shrink)
+        return read_bench_scene(
+            found,
+            validation=self.validation,
+            validation_seed=self.validation_seed,
+            shrink=self.shrink,
+        )
 
 
 class RunSource(RunOrigin):
@@ -74,12 +80,15 @@ def read_source(folder: Path) -> RunSource:
     )
 
 
-def read_bench_scene(found: DetectedFormat, *, validation: bool, shrink: int = 1) -> Scene:
+def read_bench_scene(
+    found: DetectedFormat, *, validation: bool, validation_seed: int = 0, shrink: int = 1
+) -> Scene:
     """Read a scene as runs use it: in bench, in its workers, and when a run is opened later.
 
     Args:
         found: Folder of the scene, with its format.
         validation: True for the training views alone, some of which are test views.
+        validation_seed: Of the choice of these.
         shrink: Divisor of the width and height of all images.
 
     Raises:
@@ -91,7 +100,7 @@ def read_bench_scene(found: DetectedFormat, *, validation: bool, shrink: int = 1
     if validation:
         from chronoscene.scene.split_making import hold_out_validation  # scipy takes time to load
 
-        return hold_out_validation(scene)
+        return hold_out_validation(scene, validation_seed)
     return scene
 
 

@@ -107,6 +107,7 @@ def _runs_of_scene(
                 scene_format=scene.source.name,
                 period_by=scene.source.period_by,
                 validation=own.validation,
+                validation_seed=own.validation_seed,
                 shrink=own.shrink,
             ),
             scene=scene.content.name,

@@ -240,7 +240,7 @@ def _config(spec: MethodSpec, settings: RunSettings) -> MethodConfig:
 
 def _unusual(settings: RunSettings) -> dict[str, Any]:
     """Return settings that most runs leave empty, as far as these do not."""
-    names = ("validation", "fit_half", "protocol")
+    names = ("validation", "validation_seed", "fit_half", "protocol")
     return {name: value for name in names if (value := getattr(settings, name))}
 
 

@@ -44,7 +44,10 @@ def read_scenes(settings: BenchSettings, log: Log) -> Iterator[BenchScene]:
     for found in settings.scenes:
         log(f"read {found.path}")
         scene = read_bench_scene(
-            found, validation=settings.run.validation, shrink=settings.run.shrink
+            found,
+            validation=settings.run.validation,
+            validation_seed=settings.run.validation_seed,
+            shrink=settings.run.shrink,
         )
         if scene.name in scenes:
             other = scenes[scene.name][0].root

@@ -55,6 +55,8 @@ class RunSettings:
     """``auto``, ``cpu`` or ``cuda``."""
     validation: bool = False
     """True if views held back from the training views are scored, and test views are not read."""
+    validation_seed: int = 0
+    """Seed of the choice of these views."""
     fit_half: bool = False
     """True if appearance is fitted to the left half of test photos, and the right half scored."""
     photo_memory: int = PHOTO_MEMORY
@@ -115,6 +117,13 @@ class BenchSettings:
             check_choice("--strategy", strategy, STRATEGIES)
         if self.run.separate_iterations is not None:
             check_choice("--separate-iterations", self.run.separate_iterations, SHARING)
+        if self.run.validation_seed and not self.run.validation:
+            raise ConfigError(
+                "--validation-seed",
+                expected="--validation with it",
+                found="it alone",
+                todo="add --validation, or leave it out",
+            )
         if self.run.protocol:
             run = self.run
             fixed = self.scenes, self.strategies, run.max_width, run.validation
@@ -146,9 +155,10 @@ class BenchSettings:
         for option, number in counts.items():
             if number is not None and not (type(number) is int and number >= 1):
                 raise _refused(option, "a whole number of 1 or more", number)
-        for seed in self.seeds:
+        seeds = [("--seed", seed) for seed in self.seeds]
+        for option, seed in (*seeds, ("--validation-seed", self.run.validation_seed)):
             if not (type(seed) is int and 0 <= seed < 2**64):
-                raise _refused("--seed", "seeds from 0 to 2^64 - 1", seed)
+                raise _refused(option, "seeds from 0 to 2^64 - 1", seed)
         budget = self.run.budget_seconds
         if budget is not None and not (isinstance(budget, Real) and 0 < budget < math.inf):
             raise _refused("--budget", "a positive number of seconds", budget)

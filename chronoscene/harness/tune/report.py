@@ -29,13 +29,14 @@ class TrialResult:
 
     number: int
     psnr: float | None
-    """Mean over scenes of the macro mean over validation views, in dB; None if it failed."""
+    """Mean over scenes, and choices of validation views, of the macro mean over these views, in dB;
+    None if it failed."""
     ssim: float | None
     """Mean of the same kind, which the search does not use; also None in trials that lack it."""
     seconds: float
-    """Training clock, sum over the scenes."""
+    """Training clock, sum over all trainings."""
     checkpoint_bytes: int
-    """Sum over the scenes."""
+    """Sum over all trainings."""
     options: dict[str, Any]
     """Value of each option of the search space."""
     failure: str
@@ -117,7 +118,7 @@ def write_report(
         base=base,
         options={name: value for name, value in found.items() if value != start[name]},
         tuning={
-            **{key: about[key] for key in ("scenes", "strategy", "seed", "iterations")},
+            **{key: about[key] for key in ("scenes", "strategy", "seed", "iterations", "splits")},
             "trials": len(results),
             "failed": sum(result.psnr is None for result in results),
             "best_trial": best.number,

@@ -61,6 +61,7 @@ class _Search:
     out: Path
     method: ResolvedMethod
     seed: int
+    splits: int
     study: Study
     about: dict[str, Any]
     """Values that identify the search: one with others needs another folder."""
@@ -71,19 +72,33 @@ class _Search:
         write_report(results, self.method, self.about, self.out)
         return results
 
-    def trial_settings(self, trial: Trial) -> BenchSettings:
-        """Return the settings of the bench of a trial."""
+    def folder(self, trial: Trial) -> Path:
+        """Return the folder of a trial."""
+        return self.out / TRIALS / f"{trial.number:03d}"
+
+    def places(self, trial: Trial) -> list[Path]:
+        """Return the folders of runs of a trial, one for each choice of views."""
+        folder = self.folder(trial)
+        return [folder / str(i) for i in range(self.splits)] if self.splits > 1 else [folder]
+
+    def benches(self, trial: Trial) -> list[BenchSettings]:
+        """Return the settings of the benches of a trial, one for each choice of views."""
         drawn = draw(trial, self.method.spec, self.method.config)
-        run = replace(
-            self.settings.run,
-            runs=self.out / TRIALS / f"{trial.number:03d}",
-            overrides={name: as_typed(value) for name, value in drawn.items()},
-        )
-        return replace(self.settings, run=run)
+        overrides = {name: as_typed(value) for name, value in drawn.items()}
+        run = replace(self.settings.run, overrides=overrides)
+        return [
+            replace(self.settings, run=replace(run, runs=place, validation_seed=seed))
+            for seed, place in enumerate(self.places(trial))
+        ]
 
 
 def tune(
-    settings: BenchSettings, trials: int, log: Log, *, execute: Execute | None = None
+    settings: BenchSettings,
+    trials: int,
+    log: Log,
+    *,
+    splits: int = 1,
+    execute: Execute | None = None,
 ) -> list[TrialResult]:
     """Search for options with the best mean PSNR on validation views.
 
@@ -95,6 +110,8 @@ def tune(
             that of the search.
         trials: Number of trials in all, failed ones among them. The first is the preset as it is.
         log: Called with lines for the user.
+        splits: Number of choices of validation views. Each trial trains each scene with all of
+            them, and its score is the mean.
         execute: As for `run_bench`.
 
     Returns:
@@ -109,7 +126,7 @@ def tune(
     out = settings.run.runs
     out.mkdir(parents=True, exist_ok=True)
     with alone_in(out, "--out"):
-        search = _open(settings, out, log)
+        search = _open(settings, splits, out, log)
         missing = trials - sum(trial.state.is_finished() for trial in search.study.trials)
         if missing > 0:
             _run_trials(search, trials, missing, log, execute)
@@ -124,7 +141,7 @@ def tune(
     return results
 
 
-def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
+def _open(settings: BenchSettings, splits: int, out: Path, log: Log) -> _Search:
     """Open the study of a folder, or begin it with the preset as its first trial."""
     optuna = import_extra("optuna", "tune", "chronoscene tune")
     from optuna.storages import JournalStorage
@@ -141,7 +158,7 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
             log(f"{name} is not searched: it has no effect without {needed}")
     method = replace(method, spec=replace(method.spec, search=searched))
     start = starting_point(method.spec, method.config)
-    ours = _about(settings, method, log)
+    ours = _about(settings, method, log) | {"splits": splits}
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = JournalStorage(JournalFileBackend(str(out / JOURNAL)))
     study = optuna.create_study(
@@ -150,8 +167,8 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
     stored = study.user_attrs.get(SETTINGS)
     if stored is None:
         study.set_user_attr(SETTINGS, ours)
-    elif stored != ours:
-        old, new = first_difference(stored, ours)
+    elif (known := {"splits": 1} | stored) != ours:  # searches of earlier versions do not say it
+        old, new = first_difference(known, ours)
         raise ConfigError(
             f"--out {out}",
             expected=f"a search with {new}",
@@ -160,7 +177,7 @@ def _open(settings: BenchSettings, out: Path, log: Log) -> _Search:
         )
     if not study.trials:
         study.enqueue_trial(start)
-    return _Search(settings, out, method, seed, study, ours)
+    return _Search(settings, out, method, seed, splits, study, ours)
 
 
 def _about(settings: BenchSettings, method: ResolvedMethod, log: Log) -> dict[str, Any]:
@@ -192,26 +209,26 @@ def _run_trials(
     search: _Search, trials: int, missing: int, log: Log, execute: Execute | None
 ) -> None:
     queue = islice(_queue(search, trials), missing)  # more may be left if several ran at a time
-    under_way: dict[Future[BenchOutcome], Trial] = {}
+    under_way: dict[Future[list[BenchOutcome]], Trial] = {}
     with open_pool(search.settings) as opened:
         pool = opened or LocalPool(1)
-        total = missing * len(search.settings.scenes)
+        total = missing * len(search.settings.scenes) * search.splits
         with RunsDisplay(total, log) as display, ThreadPoolExecutor(pool.at_once) as threads:
             accepted = _accepted(search, queue, display.log)
             try:
                 while True:
                     while len(under_way) < pool.at_once and (ready := next(accepted, None)):
-                        trial, settings = ready
-                        plan = plan_runs(settings, _silent)
-                        future = threads.submit(_run, plan, settings, pool, display, execute)
+                        trial, benches = ready
+                        plans = [(plan_runs(bench, _silent), bench) for bench in benches]
+                        future = threads.submit(_run, plans, pool, display, execute)
                         under_way[future] = trial
                     if not under_way:
                         return
                     for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-                        outcome = future.result()
-                        reasons = [failure.reason for failure in outcome.failures]
-                        trial = under_way.pop(future)
-                        _finish(search, trial, outcome.finished, reasons, display.log)
+                        outcomes = future.result()
+                        finished = [run for one in outcomes for run in one.finished]
+                        reasons = [failure.reason for one in outcomes for failure in one.failures]
+                        _finish(search, under_way.pop(future), finished, reasons, display.log)
             except BaseException:
                 pool.stop.ask()
                 raise
@@ -219,13 +236,13 @@ def _run_trials(
 
 def _accepted(
     search: _Search, queue: Iterable[Trial], log: Log
-) -> Iterator[tuple[Trial, BenchSettings]]:
+) -> Iterator[tuple[Trial, list[BenchSettings]]]:
     """Yield trials with their settings; those whose options the method refuses have failed."""
     refusals = 0
     for trial in queue:
-        settings = search.trial_settings(trial)
+        benches = search.benches(trial)
         try:
-            resolve_methods(settings.methods, settings.run)
+            resolve_methods(benches[0].methods, benches[0].run)
         except ConfigError as error:
             refusals += 1
             _finish(search, trial, (), [str(error)], log)
@@ -239,7 +256,7 @@ def _accepted(
                 ) from error
         else:
             refusals = 0
-            yield trial, settings
+            yield trial, benches
 
 
 def _silent(line: str) -> None:
@@ -267,9 +284,12 @@ def _queue(search: _Search, trials: int) -> Iterator[Trial]:
 
 
 def _run(
-    plan: Plan, settings: BenchSettings, pool: Pool, display: RunsDisplay, execute: Execute | None
-) -> BenchOutcome:
-    """Run the scenes of a trial, in a thread of its own."""
+    plans: Sequence[tuple[Plan, BenchSettings]],
+    pool: Pool,
+    display: RunsDisplay,
+    execute: Execute | None,
+) -> list[BenchOutcome]:
+    """Run the benches of a trial, in a thread of its own."""
 
     def in_pool(job: Job) -> records.Failure | None:
         with display.showing() as report:
@@ -277,7 +297,7 @@ def _run(
                 display.leave_out(report)
         return failure
 
-    return run_plan(plan, settings, _silent, execute=execute or in_pool)
+    return [run_plan(*planned, _silent, execute=execute or in_pool) for planned in plans]
 
 
 def _finish(
@@ -294,7 +314,7 @@ def _finish(
     """
     from optuna.trial import TrialState
 
-    folder = search.out / TRIALS / f"{trial.number:03d}"
+    folder = search.folder(trial)
     runs = [records.read_run(run) for run in finished]
     value, ssim = (
         sum(run.aggregates["macro"].get(name, math.nan) for run in runs) / (len(runs) or math.nan)
@@ -315,18 +335,19 @@ def _finish(
         trial.set_user_attr(name, found)
     if reason:
         search.study.tell(trial, state=TrialState.FAIL)
-        place = f", in {folder}" if folder.is_dir() else ""
-        log(f"trial {trial.number} failed: {reason}{place}")
+        where = f", in {folder}" if folder.is_dir() else ""
+        log(f"trial {trial.number} failed: {reason}{where}")
     else:
         search.study.tell(trial, value)
         best = search.study.best_trial
         log(f"trial {trial.number}: {value:.3f} dB; best {best.value:.3f} dB ({best.number})")
     parts = (records.CHECKPOINT, records.PREDICTIONS, records.STAGES)
-    bulky = [path for part in parts for path in folder.glob(f"*/*/seed*/{part}")]
-    # Scenes may have the names of these two folders.
-    bulky += [path.parent for path in folder.glob(f"{records.GROUND_TRUTH}/*/{MANIFEST}")]
-    for path in bulky:
-        shutil.rmtree(path, ignore_errors=True)
-    for path in folder.glob(f"{records.PHOTOS}/*.npz"):
-        path.unlink(missing_ok=True)
+    for place in search.places(trial):
+        bulky = [path for part in parts for path in place.glob(f"*/*/seed*/{part}")]
+        # Scenes may have the names of these two folders.
+        bulky += [path.parent for path in place.glob(f"{records.GROUND_TRUTH}/*/{MANIFEST}")]
+        for path in bulky:
+            shutil.rmtree(path, ignore_errors=True)
+        for path in place.glob(f"{records.PHOTOS}/*.npz"):
+            path.unlink(missing_ok=True)
     search.results()

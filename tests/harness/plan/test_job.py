@@ -188,8 +188,8 @@ def test_the_command_names_what_differs_from_the_preset():
     ]
     config["variant"] = "iterations=20+50"
     assert command_line("DIR", config).endswith(" --continue-to 50")
-    config["variant"] = "validation=true,fit_half=true"
-    assert command_line("DIR", config).endswith(" fast --validation --fit-half")
+    config["variant"] = "validation=true,validation_seed=2,fit_half=true"
+    assert command_line("DIR", config).endswith(" fast --validation --validation-seed 2 --fit-half")
     config["variant"] = "sh_degree=2,budget=90s"
     assert command_line("DIR", config, 0).endswith("--seed 0 --set sh_degree=2 --budget 90s")
 

@@ -58,3 +58,17 @@ def test_a_folder_of_runs_has_one_split(bench_here):
     bench_here("toy_methods:MEAN")
     with pytest.raises(ConfigError, match=r"another split of it.*choose another folder with --out"):
         bench_here("toy_methods:MEAN", validation=True)
+
+
+def test_another_seed_holds_other_views_back(bench_here, tmp_path):
+    found = []
+    for seed in (0, 1, 2):
+        options = {"runs": tmp_path / str(seed), "validation": True, "validation_seed": seed}
+        (folder,) = bench_here("3dgs", iterations=5, **options)[0].finished
+        found.append(views(folder / "predictions"))
+        assert not found[-1] & {*TESTS}
+        assert {f.name for f in open_run(folder).scene().select(split="test")} == found[-1]
+        assert read_run(folder).variant.endswith(f",validation_seed={seed}") is (seed > 0)
+    assert found[1] != found[0] or found[2] != found[0]
+    with pytest.raises(ConfigError, match=r"--validation-seed: expected --validation with it"):
+        bench_here("toy_methods:MEAN", validation_seed=1)

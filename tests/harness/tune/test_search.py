@@ -32,10 +32,13 @@ def search(scene_folder, tmp_path, monkeypatch, lines):
     """Search in this process; returns the results."""
     monkeypatch.setattr("chronoscene.harness.train.worker.warm_up", lambda *args, **options: None)
 
-    def run(out, trials=3, *, execute=execute_here, method="toy_methods:TUNED", **changes):
+    def run(
+        out, trials=3, *, splits=1, execute=execute_here, method="toy_methods:TUNED", **changes
+    ):
         fields = {"scenes": (scene_folder,), "methods": (method,), "runs": tmp_path / out}
         fields |= {"threads": 1, **changes}
-        return tune(bench_settings(**fields), trials, lines.append, execute=execute)
+        settings = bench_settings(**fields)
+        return tune(settings, trials, lines.append, splits=splits, execute=execute)
 
     return run
 
@@ -130,6 +133,25 @@ def test_the_first_trial_is_the_preset_and_the_best_one_becomes_a_preset(
     assert [float(row["ssim"]) for row in rows] == [result.ssim for result in results]
     kept = {p.name for p in (tmp_path / "out/trials").rglob("*") if p.is_file()}
     assert {"run.json", "results.json"} <= kept and not any("png" in name for name in kept)
+
+
+def test_the_score_of_several_choices_of_views_is_their_mean(search, bench_here, tmp_path):
+    results = search("out", 3, splits=2)
+    preset = tmp_path / "out/preset.toml"
+    assert tomllib.loads(preset.read_text())["tuning"]["splits"] == 2
+    macros = []
+    for seed in range(2):
+        options = {"preset": str(preset), "validation": True, "validation_seed": seed}
+        outcome = bench_here("toy_methods:TUNED", runs=tmp_path / str(seed), **options)[0]
+        macros.append(read_run(outcome.finished[0]).aggregates["macro"])
+    assert macros[0] != macros[1]
+    for name in ("psnr", "ssim"):
+        assert getattr(best_of(results), name) == sum(macro[name] for macro in macros) / 2
+    kept = [p.name for p in (tmp_path / "out/trials").rglob("*") if p.is_file()]
+    assert kept.count("run.json") == 6 and not any("png" in name for name in kept)
+    assert search("out", 3, splits=2) == results
+    with pytest.raises(ConfigError, match="a search with splits 3, found one with splits 2"):
+        search("out", 4, splits=3)
 
 
 def test_failed_trials_count(search, tmp_path, lines):
