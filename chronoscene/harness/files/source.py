@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, NonNegativeInt
 
 from chronoscene.formats import DetectedFormat, detect
 from chronoscene.harness.files.records import SOURCE_FILE, read_document
@@ -32,7 +32,7 @@ class RunOrigin(BaseModel):
     """Rule by which the images are grouped into periods, as for `read_scene`."""
     validation: bool = False
     """Argument of `read_bench_scene`, as the next two."""
-    validation_seed: int = 0
+    validation_seed: NonNegativeInt = 0
     shrink: int = 1
 
     def read_scene(self, root: Path | None = None) -> Scene:
