@@ -186,6 +186,8 @@ def _about(settings: BenchSettings, method: ResolvedMethod, log: Log) -> dict[st
     for found in settings.scenes:
         log(f"read {found.path}")
         scene = read_bench_scene(found, validation=True)
+        held = len(scene.select(split="test"))
+        log(f"{scene.name}: {held} of {len(scene.frames)} training views are held back")
         scenes.append({"name": scene.name, "hash": scene_hash(scene)})
     about = {
         "method": method.spec.name,

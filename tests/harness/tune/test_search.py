@@ -135,8 +135,9 @@ def test_the_first_trial_is_the_preset_and_the_best_one_becomes_a_preset(
     assert {"run.json", "results.json"} <= kept and not any("png" in name for name in kept)
 
 
-def test_the_score_of_several_choices_of_views_is_their_mean(search, bench_here, tmp_path):
+def test_the_score_of_several_choices_of_views_is_their_mean(search, bench_here, tmp_path, lines):
     results = search("out", 3, splits=2)
+    assert "ring: 2 of 5 training views are held back" in lines
     preset = tmp_path / "out/preset.toml"
     assert tomllib.loads(preset.read_text())["tuning"]["splits"] == 2
     macros = []
