@@ -18,7 +18,8 @@ _SHORT: dict[str, Any] = {
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
-    "fast": _SHORT | {"iterations": 1_000, "density_interval": 40, "half_size_share": 0.5},
+    "fast": _SHORT
+    | {"iterations": 1_000, "density_interval": 40, "half_size_share": 0.5, "depth_weight": 0.1},
     "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
     "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50, **MANY_ANCHORS},
 }
@@ -33,7 +34,7 @@ SPEC = MethodSpec(
     devices=("cpu", "cuda"),
     method="baselines.scaffold_gs.method:ScaffoldGS",
     config="baselines.scaffold_gs.config:ScaffoldGSConfig",
-    presets=_PRESETS | {"fast": _PRESETS["fast"] | {"depth_weight": 0.1}},
+    presets=_PRESETS,
     resumable=True,
     main_options=(*MAIN_OPTIONS, "appearance_dim", "scale_weight", "exposure"),
     search={
