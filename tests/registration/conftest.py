@@ -48,6 +48,7 @@ class Case:
             "database": str(self.database),
             "photos": str(self.folder / "photos"),
             "periods": self.periods,
+            "labels": [f"summer {2016 + p}" for p in range(max(self.periods.values()) + 1)],
             "priors": self.priors,
             "keep_unplaced": False,
             "out": str(self.folder / "model"),

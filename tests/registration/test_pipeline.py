@@ -92,6 +92,8 @@ def test_every_photo_that_is_missing_has_a_reason(joint: tuple[Path, Registered]
     assert counted[0] == counted[1]
     stages = [s["stage"] for s in log["stages"]]
     assert stages.index("features") < stages.index("matches") < stages.index("joint")
+    remarks = log["stages"][stages.index("matches")]["remarks"]
+    assert any(r.startswith("periods 2016 and 2023: ") for r in remarks)
 
 
 def test_the_result_hangs_together(joint: tuple[Path, Registered]) -> None:

@@ -126,10 +126,10 @@ def _matches(inputs: PhotoInputs, context: Context, given: Mapping[str, Any]) ->
             f"{found['held_out']} of {found['tracks_of_several_periods']} tracks of several "
             "periods held out",
         ]
-        remarks += [
-            f"periods {key}: {count} verified pairs, {found['matches_across'][key]} matches"
-            for key, count in found["verified_pairs_across"].items()
-        ]
+        for key, count in found["verified_pairs_across"].items():
+            a, b = (inputs.labels[int(period)] for period in key.split("-"))
+            shared = found["matches_across"][key]
+            remarks.append(f"periods {a} and {b}: {count} verified pairs, {shared} matches")
         return found, remarks
 
     return dict(context.stages.run("matches", settings, match))

@@ -123,6 +123,8 @@ def _run_route(route: Route, inputs: PhotoInputs, matched: Matched, context: Con
         settings["keep_unplaced"] = context.options.tie_points is not None
         settings["focals"] = inputs.focals()
         settings["full_lens"] = context.options.camera_model == AUTO
+    if route == "separate":
+        settings["labels"] = list(inputs.labels)
     result = _estimate(route, route, settings, context)
     registered = _assemble(route, route, result, inputs, context)
     missing = set(inputs.periods) - set(registered.names)

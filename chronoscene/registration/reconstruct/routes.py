@@ -78,7 +78,12 @@ def _mapped(
 
 
 def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
-    """Map each period alone, then align, merge and adjust the models. Arguments as in `joint`."""
+    """Map each period alone, then align, merge and adjust the models.
+
+    Args:
+        arguments: As in `joint`, and ``labels`` of the periods.
+        report: Receives progress.
+    """
     task = Task.start(arguments, report)
     periods: Mapping[str, int] = arguments["periods"]
     submodels = []
@@ -87,7 +92,8 @@ def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         models = _mapped(task, names, arguments, f"period-{period}")
         for i, model in enumerate(models):
             adjust(model, task)
-            label = f"period {period}" + (f" submodel {i}" if len(models) > 1 else "")
+            label = f"period {arguments['labels'][period]}"
+            label += f" submodel {i}" if len(models) > 1 else ""
             submodels.append(Submodel(label, model, period, is_largest=i == 0))
     return _merged(submodels, arguments, task)
 

@@ -79,9 +79,9 @@ def test_periods_that_nothing_connects_are_left_apart(make_case: Callable[..., A
     assert len(left) == len(case.truth) // 2
     ((period,),) = [{case.periods[name] for name in left}]
     assert result["model"]["images"] == len(case.truth) // 2
-    named = f"period {period}: {len(left)} images, {min(left)} to {max(left)}"
-    assert named in result["remarks"]
-    assert f"period {period}: {len(left)} images could not be placed" in result["remarks"]
+    named = f"period summer {2016 + period}: {len(left)} images"
+    assert f"{named}, {min(left)} to {max(left)}" in result["remarks"]
+    assert f"{named} could not be placed" in result["remarks"]
 
 
 def test_a_frozen_scene_gets_a_period(make_case: Callable[..., Any]) -> None:
