@@ -17,6 +17,8 @@ REFRESH = 0.1  # Seconds between two updates of the bar
 
 REPORTING = 1.0  # Seconds between two reports to another process
 
+SILENCE = 60.0  # Seconds after which a line is printed although no probe was scored
+
 SMOOTHING = 0.95  # Weight of the past in the loss that is shown
 
 
@@ -56,7 +58,7 @@ class ProgressDisplay:
         self._name = label
         self._loss: float | None = None
         self._psnr: float | None = None
-        self._shown = 0.0
+        self._shown = self._printed = 0.0
 
     def __enter__(self) -> ProgressDisplay:
         self._bar.start()
@@ -75,6 +77,7 @@ class ProgressDisplay:
         """Start over for the next model."""
         self._name = self.label if part == "all" else f"{self.label} {part}"
         self._stop, self._loss, self._psnr, self._shown = stop, None, None, 0.0
+        self._printed = time.monotonic()
         self._model += 1
         # The runner has named the run already, and a terminal may be 80 columns wide.
         shown = "" if part == "all" else part
@@ -104,7 +107,9 @@ class ProgressDisplay:
             self._shown = now
             status = self.status(iteration, seconds, psnr)
             self._bar.update(self._task, completed=progress, status=status)
-        elif not self._live and psnr is not None and str(psnr) != str(self._psnr):  # or nan
+        scored = psnr is not None and str(psnr) != str(self._psnr)  # or nan
+        if not self._live and (scored or now - self._printed > SILENCE):
+            self._printed = now
             status = self.status(iteration, seconds, psnr)
             self._print(f"{self._name}: {progress:4.0%} {status}, {report.primitives} primitives")
         self._psnr = psnr

@@ -40,6 +40,23 @@ def test_without_a_terminal_each_probe_is_a_line():
     ]
 
 
+def test_without_a_terminal_a_line_a_minute_shows_that_it_goes_on(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(display_module.time, "monotonic", lambda: now[0])
+    buffer = io.StringIO()
+    with ProgressDisplay("plaza: toy", Console(file=buffer, width=200)) as display:
+        display.begin("all", StopRule(1000, None))
+        for i in range(1, 16):
+            now[0] = 10.0 * i
+            display.update(i, now[0], StepReport(0.5, 12), 20.0 if i > 5 else None)
+    lines = [line.split(",")[0] for line in buffer.getvalue().splitlines()]
+    steps = (6, 13)  # a probe, and a minute later
+    assert lines == [
+        "plaza: toy: training",
+        *(f"plaza: toy: {i / 1000:4.0%} iteration {i}" for i in steps),
+    ]
+
+
 def test_on_a_narrow_terminal_there_is_a_bar_with_everything():
     text = shown(True, width=90)
     for part in ("period-1", "10%", "iteration 12345,", "loss 0.2500", "30.00 dB", "0:54 left"):
