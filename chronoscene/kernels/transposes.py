@@ -31,6 +31,10 @@ class _Rows:
     def store(self, distance: Any, value: Any) -> None:
         emit_store(self.builder, value, self._at(distance))
 
+    def times(self, i: int, stride: Any, plus: int) -> Any:
+        """The distance of a number in row i."""
+        return self.builder.add(self.builder.mul(stride, self.index(i)), self.index(plus))
+
     def _at(self, distance: Any) -> Any:
         number = self.index(distance) if isinstance(distance, int) else distance
         return self.builder.gep(self.start, [number])
@@ -79,6 +83,42 @@ def make_load_columns(count: int, lanes: int) -> Callable:
 def _vectors(count: int, lanes: int) -> Any:
     """Type of a tuple of vectors."""
     return types.UniTuple(Vector("f32", lanes), count)
+
+
+def _pieces(count: int, lanes: int) -> list[int]:
+    """First columns of the vectors that hold ``count`` columns; the last ones may overlap."""
+    return [min(first, max(count - lanes, 0)) for first in range(0, count, lanes)]
+
+
+def make_load_some_columns(count: int, lanes: int) -> Callable:
+    """Make a function that reads this many columns of a matrix with at least as many."""
+
+    @emitted(lambda array, offset, stride: _vectors(count, lanes)(array, types.intp, types.intp))
+    def load_some_columns(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Columns of ``lanes`` rows, ``stride`` numbers apart, one vector each.
+
+        Reads whole vectors of a row, of which the first begins at the offset.
+        """
+        memory = _Rows(context, builder, sig, args)
+        columns: dict[int, Any] = {}
+        for first in _pieces(count, lanes):
+            rows = [memory.load(memory.times(i, args[2], first), lanes) for i in range(lanes)]
+            columns |= enumerate(_emit_transpose(builder, rows), first)
+        return context.make_tuple(builder, sig.return_type, [columns[c] for c in range(count)])
+
+    return load_some_columns
+
+
+@emitted(lambda array, offset, stride, columns: types.void(array, types.intp, types.intp, columns))
+def store_some_columns(context: Any, builder: Any, sig: Any, args: Any) -> None:
+    """Write vectors, at least as many as lanes, as columns of rows ``stride`` numbers apart."""
+    count, lanes = len(sig.args[3]), sig.args[3][0].lanes
+    memory = _Rows(context, builder, sig, args)
+    columns = cgutils.unpack_tuple(builder, args[3], count)
+    for first in _pieces(count, lanes):
+        rows = _emit_transpose(builder, columns[first : first + lanes])
+        for i, row in enumerate(rows):
+            memory.store(memory.times(i, args[2], first), row)
 
 
 @emitted(lambda array, offset, columns: types.void(array, types.intp, columns))

@@ -25,6 +25,7 @@ LARGE_TESTS = (
     "fields/test_kernels.py",
     "training/test_losses.py",
     "training/test_photometric.py",
+    "training/test_spherical_harmonics.py",
     "training/optimizers/test_row_adam.py",
 )
 
