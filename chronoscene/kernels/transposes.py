@@ -31,9 +31,9 @@ class _Rows:
     def store(self, distance: Any, value: Any) -> None:
         emit_store(self.builder, value, self._at(distance))
 
-    def times(self, i: int, stride: Any, plus: int) -> Any:
-        """The distance of a number in row i."""
-        return self.builder.add(self.builder.mul(stride, self.index(i)), self.index(plus))
+    def in_row(self, row: int, stride: Any, column: int) -> Any:
+        """Distance of a number in a matrix whose rows are ``stride`` numbers apart."""
+        return self.builder.add(self.builder.mul(stride, self.index(row)), self.index(column))
 
     def _at(self, distance: Any) -> Any:
         number = self.index(distance) if isinstance(distance, int) else distance
@@ -102,7 +102,7 @@ def make_load_some_columns(count: int, lanes: int) -> Callable:
         memory = _Rows(context, builder, sig, args)
         columns: dict[int, Any] = {}
         for first in _pieces(count, lanes):
-            rows = [memory.load(memory.times(i, args[2], first), lanes) for i in range(lanes)]
+            rows = [memory.load(memory.in_row(i, args[2], first), lanes) for i in range(lanes)]
             columns |= enumerate(_emit_transpose(builder, rows), first)
         return context.make_tuple(builder, sig.return_type, [columns[c] for c in range(count)])
 
@@ -118,7 +118,7 @@ def store_some_columns(context: Any, builder: Any, sig: Any, args: Any) -> None:
     for first in _pieces(count, lanes):
         rows = _emit_transpose(builder, columns[first : first + lanes])
         for i, row in enumerate(rows):
-            memory.store(memory.times(i, args[2], first), row)
+            memory.store(memory.in_row(i, args[2], first), row)
 
 
 @emitted(lambda array, offset, columns: types.void(array, types.intp, columns))
