@@ -254,8 +254,8 @@ def test_white_is_drawn_behind_everything_where_asked(tmp_path: Path) -> None:
 def test_what_a_gpu_runs_trains_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain torch form of the field and of its smoothness, here on a CPU in float32.
 
-    Few steps, since Adam makes whole steps of differences that are rounding: after three, images
-    differ by 5e-6; after eight, by 1e-3.
+    Few steps, since Adam makes whole steps of gradients that are nothing but rounding. Those of the
+    rotations of round Gaussians are, so these are not round. Images differ by 3e-7.
     """
     scene, found = moving_scene(arc), []
     for compiled in (True, False):
@@ -265,10 +265,11 @@ def test_what_a_gpu_runs_trains_alike(monkeypatch: pytest.MonkeyPatch) -> None:
                 monkeypatch.setattr(f"baselines.deformation_4dgs.{module}.devices", plain)
         method = Deformation4DGS(config(coarse_until=0))
         method.setup(scene, seed=0, device="cpu")
+        method.model.parameters["log_scales"].data[:, 0] += 0.5
         losses = [method.step(index, 0.1).loss for index in range(3)]
         found.append((losses, method.render(scene.views[0], 1.5).rgb))
     np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-4)
-    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-4)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-5)
 
 
 def test_the_scaled_twin_of_the_released_configuration_has_its_values() -> None:
