@@ -140,6 +140,22 @@ def several_scenes(names: Iterable[str]) -> bool:
     return len(tests) > 1 and len({*map(scene_of, tests)}) == len(tests)
 
 
+def with_own_titles(records: Sequence[RunRecord]) -> list[RunRecord]:
+    """Add the name of the method to titles that several methods have.
+
+    Tables and figures go by the titles.
+    """
+    methods: dict[str, set[str]] = {}
+    for run in records:
+        methods.setdefault(run.title, set()).add(run.method)
+    return [
+        run.model_copy(update={"title": f"{run.title} [{run.method}]"})
+        if len(methods[run.title]) > 1
+        else run
+        for run in records
+    ]
+
+
 def each_once(records: Iterable[RunRecord]) -> list[RunRecord]:
     """Leave copies of runs out, with a notice.
 

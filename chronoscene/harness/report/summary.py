@@ -23,7 +23,7 @@ from chronoscene.harness.files.records import (
     read_failures,
     run_folders,
 )
-from chronoscene.harness.report.comparable import apart, each_once, scene_of
+from chronoscene.harness.report.comparable import apart, each_once, scene_of, with_own_titles
 from chronoscene.harness.report.differences import (
     SeedSpread,
     explained_by_seeds,
@@ -166,7 +166,8 @@ _COMPARED = ("mean", "sd", "n", "column", "views", "resampled")
 def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
     """Read all finished runs below some folders, with their rows, and the failed ones.
 
-    Copies of a run count once, and each test of a scene has a name of its own (`comparable`).
+    Copies of a run count once. Each test of a scene and each method have a name of their own
+    (`comparable`).
 
     Raises:
         CheckpointError: If a folder holds neither, or a run is damaged.
@@ -181,7 +182,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
             raise no_runs(folder)
         records += found
         failures += failed
-    return apart(each_once(records)), failures
+    return apart(with_own_titles(each_once(records))), failures
 
 
 def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chronoscene.harness.files.records import Failure, RunRecord
-from chronoscene.harness.report.comparable import apart
+from chronoscene.harness.report.comparable import apart, with_own_titles
 from chronoscene.harness.report.summary import (
     DIFFERENCE,
     ENTRY_COLUMNS,
@@ -217,7 +217,8 @@ def study_texts(
     Returns:
         ``table`` (for a terminal), ``markdown``, ``csv`` and ``json``.
     """
-    records = apart([read_scored(path) for paths in finished.values() for path in paths])
+    found = [read_scored(path) for paths in finished.values() for path in paths]
+    records = apart(with_own_titles(found))
     runs = {label: [r for r in records if r.folder in paths] for label, paths in finished.items()}
     entries = study_entries(study, runs)
     table, sentences = study_table(study, entries), directions(study, entries)

@@ -3,7 +3,13 @@
 import pytest
 from made_runs import record
 
-from chronoscene.harness.report.comparable import apart, comparable, effort_of, several_scenes
+from chronoscene.harness.report.comparable import (
+    apart,
+    comparable,
+    effort_of,
+    several_scenes,
+    with_own_titles,
+)
 
 
 def test_methods_with_the_same_preset_are_compared():
@@ -81,3 +87,14 @@ def test_a_mean_over_scenes_needs_one_test_of_each():
 
 def test_an_option_of_a_method_is_no_effort():
     assert len(comparable([record(), record("3dgs", variant="sh_degree=2")])) == 1
+
+
+def test_titles_that_methods_share_name_the_method():
+    runs = [
+        record("a", title="T"),
+        record("b", title="T"),
+        record("a", seed=1, title="T"),
+        record("c"),
+        record("c", preset="paper"),
+    ]
+    assert [run.title for run in with_own_titles(runs)] == ["T [a]", "T [b]", "T [a]", "C", "C"]

@@ -3,6 +3,8 @@
 import numpy as np
 from PIL import Image
 
+from chronoscene.figures import canvas
+from chronoscene.harness.files.records import read_rows, read_run, run_folders, write_run
 from chronoscene.harness.report.figures.stage import draw_stages
 from chronoscene.harness.report.summary import read_runs
 
@@ -43,3 +45,15 @@ def test_infinite_scores_of_all_stages_are_drawn(bench_here, tmp_path):
     }
     (path,) = draw_stages(tmp_path / "runs", [run.model_copy(update={"stages": stages})])
     assert path.stat().st_size > 1_000
+
+
+def test_methods_with_one_title_have_a_map_each(bench_here, tmp_path, monkeypatch):
+    bench_here("toy_methods:MEAN", "toy_methods:TUNED", strategies=("sequential",))
+    runs, drawn = tmp_path / "runs", []
+    for folder in run_folders(runs):
+        run = read_run(folder).model_copy(update={"title": "Toy"})
+        write_run(folder, run, read_rows(folder))
+    monkeypatch.setattr(canvas, "save", lambda figure, *_, **__: drawn.append(figure))
+    draw_stages(runs, read_runs([runs])[0])
+    titles = [axes.get_title() for axes in drawn[0].axes if axes.get_title().endswith("PSNR [dB]")]
+    assert [title.partition("\n")[0] for title in titles] == ["Toy [mean]", "Toy [tuned]"]
