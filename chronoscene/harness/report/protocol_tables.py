@@ -9,7 +9,7 @@ from statistics import fmean
 from chronoscene.harness.files.protocols import PROTOCOLS
 from chronoscene.harness.files.records import RunRecord
 from chronoscene.harness.report.published import PublishedTable
-from chronoscene.harness.report.summary import MEASURED, name_of
+from chronoscene.harness.report.summary import MEASURED, labelled
 from chronoscene.io.tables import Table
 from chronoscene.metrics.registry import metric_info
 
@@ -38,10 +38,10 @@ def protocol_rows(published: PublishedTable, records: Sequence[RunRecord]) -> li
 
 def _measured(name: str, records: Sequence[RunRecord]) -> Iterator[ProtocolRow]:
     groups: dict[str, dict[str, list[RunRecord]]] = {}
-    for run in records:
-        if run.protocol == name:
-            scenes = groups.setdefault(name_of(run), {})
-            scenes.setdefault(run.scene_hash, []).append(run)  # one may have several names
+    runs = [run for run in records if run.protocol == name]
+    for run, label in zip(runs, labelled(runs).label, strict=True):
+        scenes = groups.setdefault(label, {})
+        scenes.setdefault(run.scene_hash, []).append(run)  # one may have several names
     for label, scenes in groups.items():
         values: dict[str, float | None] = {}
         for metric in PROTOCOLS[name].metrics:

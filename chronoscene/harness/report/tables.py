@@ -84,7 +84,8 @@ def format_runs(
         printed = published_entries(published, scenes)
         wanted = printed.quantity.isin(metrics) if metrics else slice(None)
         entries = pd.concat([entries, printed[wanted]])
-    entries = entries.assign(label=entries.label.map(_renamed(entries.label.unique(), renames)))
+    names = _renamed(entries.label.unique(), renames)
+    entries = entries.assign(label=entries.label.map(names))
     listed = entries[entries.quantity.isin(metrics)] if metrics else entries
     if style == "csv":
         # NaN is a spread that is not defined, an empty cell that there is none.
@@ -95,7 +96,10 @@ def format_runs(
     beside = []
     if published is not None:
         notes += published_notes(published, records)
-        beside = protocol_rows(published, records)
+        beside = [
+            replace(row, method=names.get(row.method, row.method))
+            for row in protocol_rows(published, records)
+        ]
     if style == "json":
         found = [json_entry(entry) for entry in listed[[*ENTRY_COLUMNS]].to_dict("records")]
         document: dict[str, Any] = {"entries": found, "notes": notes}

@@ -43,6 +43,22 @@ def test_a_scene_with_two_names_counts_once():
     assert row["scenes"] == 2 and row["values"]["psnr"] == 23.0
 
 
+def test_one_seed_of_two_commits_is_two_rows():
+    runs = [wat("spa", 20.0), wat("spa", 26.0, commit="def"), wat("spa", 21.0, seed=1)]
+    rows = json.loads(format_runs(runs, [], "json", published=load_published()))["protocols"]
+    found = {row["method"]: row["values"]["psnr"] for row in rows[:2]}
+    name = "CLNERF (joint, fast, protocol=wat)"
+    assert found == {f"{name} [code abc]": 20.5, f"{name} [code def]": 26.0}
+
+
+def test_methods_are_renamed_here_too():
+    options = {"published": load_published(), "renames": {"CLNERF (joint, ": "Ours ("}}
+    table = format_runs([wat("spa", 20.0)], [], "markdown", **options)
+    first, *others = table.split("\n\n**")
+    assert "Ours (fast, protocol=wat)" in first and "CLNERF" not in first
+    assert all("Ours (fast, protocol=wat)" in other for other in others)
+
+
 def test_a_metric_that_was_not_computed_is_a_dash():
     run = wat("spa", 20.0, ssim=None)
     table = format_runs([run], [], "markdown", published=load_published())
