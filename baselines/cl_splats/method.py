@@ -39,7 +39,7 @@ class CLSplats(GaussianMethod):
 
     def start(self, train: TrainingSet, *, seed: int, device: str) -> GaussianTrainer:
         """Under ``joint``, too, the model begins with what the first period shows."""
-        config, first = self.config, train.views[0].period
+        config, first = self.config, min(view.period for view in train.views)
         seen = train.point_periods[:, first]
         points = replace(train, points=train.points[seen], colors=train.colors[seen])
         parameters = initialise(points, opacity=config.initial_opacity, scale=config.initial_scale)

@@ -447,6 +447,27 @@ def test_one_training_takes_the_periods_in_order() -> None:
             assert trainer.timeline.last_moment == moment
 
 
+def test_periods_whose_photos_are_listed_in_another_order_give_the_same_model() -> None:
+    """Views are listed by their names, which need not follow the dates."""
+    stages = [stage(0), second(begun())]
+    images = [part.load_image(i) for part in stages for i in range(10)]
+    seen = np.ones((60, 2), bool)
+    seen[:20, 0] = False
+    views = tuple(view for part in stages for view in part.views)
+    joint = replace(stages[1], views=views, point_periods=seen, load_image=images.__getitem__)
+    models = []
+    for given in (joint, joint.with_views([*range(10, 20), *range(10)])):
+        method = CLSplats(config())
+        method.setup(given, seed=0, device="cpu")
+        for index in range(80):
+            method.step(index, index / 80)
+        models.append(method.stored_tensors())
+    first, other = models
+    assert first[LIVES][:, 0].unique().tolist() == [0, 1]
+    assert first.keys() == other.keys()
+    assert all(torch.equal(first[name], other[name]) for name in first)
+
+
 def test_moments_are_steps_of_the_period_where_schedules_are_not_stretched(tmp_path: Path) -> None:
     """A training that goes on from a checkpoint within the second period has them, too."""
     views = tuple(view for period in (0, 1) for view in stage(period).views)
