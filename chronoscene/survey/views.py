@@ -17,9 +17,9 @@ from chronoscene.arrays import Array, Ints
 from chronoscene.errors import ConfigError
 from chronoscene.harness.files.predictions import to_bytes
 from chronoscene.harness.use.cameras import Viewpoint
-from chronoscene.harness.use.changes import surface_depth
+from chronoscene.harness.use.changes import surface_depth, where_counted
 from chronoscene.harness.use.trained_run import TrainedRun
-from chronoscene.images.store import evaluation_size, resize_camera
+from chronoscene.images.store import ImageStore
 from chronoscene.methods import Prediction
 from chronoscene.scene import Scene
 from chronoscene.scene.cameras import project_points
@@ -60,11 +60,16 @@ def solid_depth(prediction: Prediction) -> NDArray[np.float32]:
 
 
 def depth_views(run: TrainedRun, scene: Scene, period: int) -> Iterator[DepthView]:
-    """Render the training photos of a period, at most `MAX_WIDTH` wide."""
+    """Render the training photos of a period, at most `MAX_WIDTH` wide.
+
+    There is no surface where a photo does not count.
+    """
     width = min(MAX_WIDTH, run.record.max_width)
+    store = ImageStore(scene, max_width=width, memory_limit=0)
     for frame in scene.select(split="train", period=period):
-        camera = resize_camera(frame.camera, *evaluation_size(*frame.camera.size, width))
+        camera = store.camera(frame)
         shown = run.render(camera, frame.cam_from_world, period)
+        shown = where_counted(shown, store.load_mask(frame))
         viewpoint = Viewpoint(frame.name, camera, frame.cam_from_world, period)
         yield DepthView(viewpoint, solid_depth(shown), to_bytes(shown.rgb))
 

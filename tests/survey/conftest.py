@@ -1,6 +1,7 @@
-"""The scene of `surveyed`, with a folder."""
+"""The scene of `surveyed`, with a folder of photos."""
 
 import pytest
+from PIL import Image
 from surveyed import make_scene
 
 
@@ -8,4 +9,8 @@ from surveyed import make_scene
 def scene(tmp_path):
     root = tmp_path / "scene"
     root.mkdir()
-    return make_scene(root)
+    made = make_scene(root)
+    for frame in made.frames:
+        made.image_path(frame).parent.mkdir(exist_ok=True)
+        Image.new("RGB", frame.camera.size).save(made.image_path(frame))
+    return made

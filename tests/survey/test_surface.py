@@ -5,6 +5,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from PIL import Image
+from scipy.ndimage import binary_erosion as erode
 from surveyed import CAMERA, HIGH, LOW, ROOF, ToyRun, render
 
 from chronoscene.errors import ConfigError
@@ -40,6 +42,23 @@ def test_each_cell_has_the_height_at_its_centre(scene, resolution):
     np.testing.assert_allclose(surface.heights[known & ~roof], 0.0, atol=1e-3)
     assert known.mean() > 0.9
     assert (surface.colors[roof] == np.round(ROOF * 255)).all()
+
+
+def test_what_masks_ignore_is_not_known(scene):
+    masks = {}
+    for frame in scene.select(period=1)[2:]:  # two photos see everything
+        camera, pose = frame.camera, frame.cam_from_world
+        masks[frame.name] = scene.root / f"{frame.name}.mask.png"
+        roof = (render(camera, pose, 1).rgb == ROOF.astype(np.float32)).all(axis=2)
+        Image.fromarray(np.where(roof, 0, 255).astype(np.uint8)).save(masks[frame.name])
+    scene = replace(scene, masks=masks)
+    views = list(depth_views(ToyRun(), scene, 1))
+    grid, surface = surface_of(scene, 1, views=views)
+    inside = erode(on_roof(grid), iterations=2)  # far from pixels that count
+    assert (surface.views[inside] == 2).all() and (surface.views[~on_roof(grid)] > 2).mean() > 0.9
+    grid, surface = surface_of(scene, 1, views=views[1:])
+    assert np.isnan(surface.heights[inside]).all()
+    assert (views[0].depth > 0).all() and np.isinf(views[2].depth).any()
 
 
 def test_metres_that_differ_between_east_and_north(scene):

@@ -74,8 +74,11 @@ def map_pair(run: TrainedRun, scene: Scene, pair: tuple[int, int], *, render: Re
     if "depth" not in run.spec.outputs:
         raise _unfit(run, "a method that renders depth", "one that does not")
     store = ImageStore(scene, max_width=_width(run))
-    frames = [frame for frame in scene.select(split="train") if frame.period in pair]
-    return map_changes(render, [_viewpoint(store, frame) for frame in frames], pair)
+    frames = {f.name: f for f in scene.select(split="train") if f.period in pair}
+    viewpoints = [_viewpoint(store, frame) for frame in frames.values()]
+    return map_changes(
+        render, viewpoints, pair, load_mask=lambda view: store.load_mask(frames[view.name])
+    )
 
 
 def _unfit(run: TrainedRun, expected: str, found: str) -> ConfigError:

@@ -17,7 +17,7 @@ periods, without their brightness, differ by more than one affine map for the wh
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, pairwise
 
@@ -111,7 +111,11 @@ class ChangeMap:
 
 
 def map_changes(
-    render: Render, viewpoints: Sequence[Viewpoint], periods: tuple[int, int]
+    render: Render,
+    viewpoints: Sequence[Viewpoint],
+    periods: tuple[int, int],
+    *,
+    load_mask: Callable[[Viewpoint], Mask | None] = lambda _: None,
 ) -> ChangeMap:
     """Compare two periods.
 
@@ -119,15 +123,22 @@ def map_changes(
         render: Renders the model, with depth in units of the world.
         viewpoints: Training cameras of the two periods.
         periods: The two periods in their order.
+        load_mask: Returns the pixels of a photo that count, None if all do: its camera sees nothing
+            at the others. [H, W]
 
     Raises:
         ConfigError: If one of them shows nothing.
     """
+
+    def seen_by(viewpoint: Viewpoint, period: float) -> Prediction:
+        shown = render(viewpoint.camera, viewpoint.cam_from_world, period)
+        return where_counted(shown, load_mask(viewpoint))
+
     found: dict[int, list[Array]] = {period: [np.zeros((0, 3))] for period in periods}
     depths = []
     for viewpoint in viewpoints:
         assert viewpoint.period is not None
-        depth = surface_depth(render(viewpoint.camera, viewpoint.cam_from_world, viewpoint.period))
+        depth = surface_depth(seen_by(viewpoint, viewpoint.period))
         step = max(1, round(viewpoint.camera.width / COLUMNS))
         found[int(viewpoint.period)].append(back_project(depth, viewpoint, step))
         depths.append(depth[::step, ::step].ravel())
@@ -144,7 +155,7 @@ def map_changes(
     distance = float(np.median(depth[np.isfinite(depth)]))
     surfaces = [_Surface(_thinned(xyz, CELL * distance)) for xyz in places.values()]
     for viewpoint in viewpoints:
-        seen = [render(viewpoint.camera, viewpoint.cam_from_world, period) for period in periods]
+        seen = [seen_by(viewpoint, period) for period in periods]
         for surface, period, shown in zip(surfaces, periods, (seen, seen[::-1]), strict=True):
             surface.look(viewpoint, *shown, is_other=viewpoint.period != period)
     known = np.concatenate([surface.other_views > 0 for surface in surfaces])
@@ -213,6 +224,13 @@ def usual_pairs(periods: int) -> list[tuple[int, int]]:
     of many periods."""
     numbers = range(periods)
     return list(combinations(numbers, 2) if periods <= ALL_PAIRS else pairwise(numbers))
+
+
+def where_counted(prediction: Prediction, mask: Mask | None) -> Prediction:
+    """Remove the depth of pixels that a mask ignores: a model never learned what is there."""
+    if mask is None or prediction.depth is None:
+        return prediction
+    return replace(prediction, depth=np.where(mask, prediction.depth, 0))
 
 
 def surface_depth(prediction: Prediction) -> Array:

@@ -16,6 +16,7 @@ from chronoscene.harness.use.change_scores import changes_csv, changes_table, ma
 from chronoscene.harness.use.changes import GEOMETRY, usual_pairs
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.images import truth
+from chronoscene.scene.cameras import project_points
 
 
 @pytest.fixture
@@ -58,10 +59,10 @@ def test_a_run_is_scored(run, scene):
     assert lines[1].endswith("," * 8)
 
 
-def masked(scene, first):
+def masked(scene, first, split="test"):
     """The scene with masks that ignore the columns before the first."""
     masks = {}
-    for frame in scene.select(split="test"):
+    for frame in scene.select(split=split):
         masks[frame.name] = scene.root / f"{frame.name.replace('/', '_')}.mask{first}.png"
         kept = np.zeros((16, 24), np.uint8)
         kept[:, first:] = 255
@@ -74,6 +75,23 @@ def test_masked_pixels_do_not_count(run, scene):
     assert {key.split("_")[2] for key in scores} == {"appearance"}  # geometry is left of it
     ((_, scores),) = map_run(run, masked(scene, 24), [(0, 1)])
     assert scores == {}
+
+
+def test_cameras_see_nothing_where_masks_ignore_their_photos(run, scene):
+    scene = masked(scene, 12, "train")
+    ((made, _),) = map_run(run, scene, [(0, 1)])
+    sights = []
+    for period in (0, 1):
+        columns = [
+            project_points(f.camera, made.xyz @ pose[:3, :3].T + pose[:3, 3])[:, 0]
+            for f in scene.select(split="train", period=period)
+            for pose in (f.cam_from_world,)
+        ]
+        sights.append(np.nanmax(columns, axis=0) >= 12)
+    own, other = np.where(made.later, sights[::-1], sights)
+    assert own.all() and other[made.known].all() and not made.known.all()
+    ((whole, _),) = map_run(run, run.scene(), [(0, 1)])
+    assert made.known.sum() < whole.known.sum()
 
 
 def test_a_scene_without_truth(run):
