@@ -102,6 +102,16 @@ class Points(PointTable):
             track_xy=self.track_xy[keep],
         )
 
+    def select_observed(self, keep: NDArray[np.bool_], rank: NDArray[np.int32]) -> Points:
+        """Keep some observations, as `select_observations`, and the points that have any of them.
+
+        All points stay where none has observations, as in a laser scan.
+        """
+        if not self.track_frame.size:
+            return self
+        points = self.select_observations(keep, rank)
+        return points.select(np.diff(points.track_start) > 0)
+
 
 @dataclass(frozen=True, slots=True)
 class Period:

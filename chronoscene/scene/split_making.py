@@ -156,11 +156,10 @@ def hold_out_validation(scene: Scene, seed: int = 0) -> Scene:
             todo="move some from test to train, or use another scene",
         )
     points, rank = scene.points, np.cumsum(training, dtype=np.int32) - 1
-    points = points.select_observations(training[points.track_frame], rank)
     whole = replace(
         scene,
         frames=frames,
-        points=points.select(np.diff(points.track_start) > 0),
+        points=points.select_observed(training[points.track_frame], rank),
         masks={f.name: scene.masks[f.name] for f in frames if f.name in scene.masks},
     )
     blocks = min(len(frames), round(2 / FRACTION))

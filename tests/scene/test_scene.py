@@ -126,6 +126,16 @@ def test_some_of_the_points(keep, starts, frames):
         assert getattr(some, name).dtype == getattr(points, name).dtype
 
 
+def test_points_that_are_still_observed_and_those_that_never_were():
+    points = tiny_scene().points
+    rank = np.arange(8, dtype=np.int32)
+    keep = np.arange(len(points.track_frame)) < 3
+    assert points.select_observed(keep, rank).ids.tolist() == points.ids[:1].tolist()
+    assert len(points.select_observed(keep & False, rank)) == 0
+    scanned = points.select_observations(keep & False, rank)
+    assert scanned.select_observed(keep[:0], rank) is scanned
+
+
 def test_select():
     scene = tiny_scene()
     assert [f.name for f in scene.select()] == ["0.png", "1.png", "2.png", "3.png"]

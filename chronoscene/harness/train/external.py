@@ -186,7 +186,6 @@ def export_part(scene: Scene, part: Part, out: Path, format: str) -> dict[str, s
     scales = np.array([np.divide(*pair) for pair in sizes])
     observed = scene.points.track_frame
     points = replace(scene.points, track_xy=scene.points.track_xy * scales[observed])
-    points = points.select_observations(rank[observed] >= 0, rank)
     frames = [
         replace(
             f,
@@ -200,7 +199,7 @@ def export_part(scene: Scene, part: Part, out: Path, format: str) -> dict[str, s
         scene,
         images_root=photos,
         frames=tuple(frames),
-        points=points.select(np.diff(points.track_start) > 0),
+        points=points.select_observed(rank[observed] >= 0, rank),
         periods=(Period(0, part.name),) if part.hides_period else scene.periods,
         masks={names[name]: mask for name, mask in masks.items()},
     )

@@ -52,6 +52,16 @@ def test_a_training_set_has_no_test_photo_and_no_point_that_only_they_see(export
             assert not pixels.any() and counts[got.frames.index(mine)] == 0
 
 
+@pytest.mark.parametrize("format", ["chronoscene", "colmap-folders", "nerfstudio"])
+def test_points_of_a_laser_scan_are_all_there(exported, make_scene, format):
+    """No image observes them, and methods that are trained here start from all of them."""
+    points = make_scene().points
+    none = np.zeros(len(points.track_frame), bool)
+    points = points.select_observations(none, np.arange(8, dtype=np.int32))
+    _, got, _ = exported(format=format, points=points)
+    np.testing.assert_allclose(got.points.xyz, points.xyz, atol=1e-6)
+
+
 def test_the_bytes_of_test_photos_are_nowhere(exported, tmp_path):
     scene, got, _ = exported()
     photos = {load_rgb(scene.image_path(f)).tobytes() for f in scene.select(split="test")}
