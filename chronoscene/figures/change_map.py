@@ -12,7 +12,7 @@ import numpy as np
 from chronoscene.arrays import Array, Ints, Pixels
 from chronoscene.figures import canvas
 from chronoscene.figures.cloud import Cloud, shown_box
-from chronoscene.figures.projections import draw_points, label_axes, readable
+from chronoscene.figures.projections import Plane, draw_points, label_axes, readable
 
 COLORS: Mapping[str, str] = {
     "unchanged": "#dedad2",
@@ -44,18 +44,26 @@ def colors_of(classes: Ints) -> Pixels:
     return palette.astype(np.uint8)[classes]
 
 
-def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path) -> None:
+def plane_from_above(up: Array) -> Plane:
+    """Choose the axes of a map: of the views along an axis, the one nearest to that from above."""
+    axis = int(np.abs(up).argmax())
+    right, ahead = (axis + 1) % 3, (axis + 2) % 3
+    return (right, ahead) if up[axis] > 0 else (ahead, right)
+
+
+def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path, *, up: Array) -> None:
     """Draw all pairs at one scale.
 
     Args:
         cloud: Points of the scene, which decide what part of it is shown.
         panels: The pairs.
         path: File to write; the suffix says the format.
+        up: Direction that is up in the scene. [3]
     """
-    box = shown_box(cloud, cameras=False)
+    box, plane = shown_box(cloud, cameras=False), plane_from_above(up)
     columns = max(min(len(panels), 3), math.ceil(math.sqrt(len(panels))))
     rows = math.ceil(len(panels) / columns)
-    size = (WIDTH, WIDTH * box.edges[1] / box.edges[0])
+    size = (WIDTH, WIDTH * box.edges[plane[1]] / box.edges[plane[0]])
     step = (WIDTH + GAP, size[1] + TITLE + GAP)
     width = LEFT + columns * step[0] - GAP + RIGHT
     lines = 2 if columns == 1 else 1  # of the legend
@@ -69,12 +77,12 @@ def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path) -> Non
         for layer in (panel.classes < FAINT, panel.classes >= FAINT):
             shown = replace(cloud, xyz=panel.xyz[layer], period=panel.classes[layer])
             shown, near, names = readable(shown, box)
-            draw_points(axes, shown, near, (0, 1), size, colors, 0)
-        label_axes(axes, (0, 1), names, size)
+            draw_points(axes, shown, near, plane, size, colors, 0)
+        label_axes(axes, plane, names, size)
         is_lowest = number + columns >= len(panels)
         axes.tick_params(labelbottom=is_lowest, labelleft=column == 0)
-        axes.set_xlabel(names[0] if is_lowest else "", fontsize=9, labelpad=2)
-        axes.set_ylabel(names[1] if column == 0 else "", fontsize=9, labelpad=2)
+        axes.set_xlabel(names[plane[0]] if is_lowest else "", fontsize=9, labelpad=2)
+        axes.set_ylabel(names[plane[1]] if column == 0 else "", fontsize=9, labelpad=2)
         axes.set_title(canvas.plain(panel.title), fontsize=9, pad=4)
     corner = (LEFT / width, 1 - 0.1 / height)
     entries = list(COLORS.items())

@@ -1,5 +1,7 @@
 """Top views of changes: what is drawn where, and how many panels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -8,6 +10,8 @@ from chronoscene.figures.canvas import rgb_of
 from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
 from chronoscene.figures.cloud import Cloud
 from chronoscene.harness.use.changes import CLASSES
+
+UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.fixture
@@ -32,6 +36,7 @@ def test_changes_are_drawn_over_what_is_below_them(cloud, tmp_path):
         cloud,
         [ChangePanel("a $b_c$", np.concatenate([ground, patch]), classes)],
         tmp_path / "x.png",
+        up=UP,
     )
     red, green, blue = np.moveaxis(
         np.asarray(Image.open(tmp_path / "x.png"), int)[100:, :, :3], 2, 0
@@ -42,6 +47,28 @@ def test_changes_are_drawn_over_what_is_below_them(cloud, tmp_path):
     ground = np.argwhere((red - blue > 5) & (green < 235))
     above, right = (new.mean(axis=0) - ground.mean(axis=0)) * (-1, 1)
     np.testing.assert_allclose(right / above, 11 / 6, rtol=0.1)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_maps_are_seen_from_above_whatever_axis_is_up(cloud, tmp_path, axis, sign):
+    """An L of changes, in a world that is turned with the scene and all but upright."""
+    ell = np.concatenate([[[x, 0, 1] for x in range(6)], [[0, y, 1] for y in range(10)]])
+    turn = np.zeros((3, 3))  # columns: where x, y and z of the cloud go
+    turn[axis, 2] = sign
+    turn[(axis + 1) % 3, 0 if sign > 0 else 1] = 1
+    turn[(axis + 2) % 3, 1 if sign > 0 else 0] = 1
+    assert np.linalg.det(turn) == 1  # no mirror
+    turned = replace(cloud, xyz=cloud.xyz @ turn.T)
+    panel = ChangePanel("", ell @ turn.T, np.full(len(ell), CLASSES.index("new")))
+    up = turn @ [0.3, -0.2, 0.9]
+    draw_changes(turned, [panel], tmp_path / "x.png", up=up)
+    red, _, blue = np.moveaxis(np.asarray(Image.open(tmp_path / "x.png"), int)[100:, :, :3], 2, 0)
+    rows, columns = np.nonzero(blue - red > 40)
+    corner = (rows > rows.max() - 3) & (columns < columns.min() + 3)
+    assert corner.any() and not ((rows < rows.max() - 3) & (columns > columns.min() + 3)).any()
+    tall, wide = np.ptp(rows), np.ptp(columns)
+    np.testing.assert_allclose(tall / wide, 9 / 5, rtol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +82,7 @@ def test_changes_are_drawn_over_what_is_below_them(cloud, tmp_path):
 )
 def test_panels_in_rows(cloud, tmp_path, panels, shape):
     panel = ChangePanel("", cloud.xyz, np.zeros(3000, int))
-    draw_changes(cloud, [panel] * panels, tmp_path / "x.png")
+    draw_changes(cloud, [panel] * panels, tmp_path / "x.png", up=UP)
     pixels = np.asarray(Image.open(tmp_path / "x.png").convert("RGB"))
     height, width = pixels.shape[:2]
     one = 3.55 * 200, height / shape[0]

@@ -21,6 +21,7 @@ from chronoscene.harness.use.changes import ALL_PAIRS, ChangeMap, usual_pairs
 from chronoscene.harness.use.trained_run import open_run
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import boxed_text
+from chronoscene.scene.orbit import find_up
 
 TITLE = 42  # Letters of both labels that fit above a map
 BETWEEN = click.option(
@@ -79,7 +80,8 @@ def command(
             _write_cloud(staged / "changes_{}_{}.ply".format(*made.periods), made)
         (staged / "changes.csv").write_text(changes_csv(maps), encoding="utf-8", newline="\n")
         panels = [_panel(made, run.record.period_labels) for made, _ in maps]
-        draw_changes(cloud_of(found), panels, staged / "changes.png")
+        up = find_up(found.frame_poses)
+        draw_changes(cloud_of(found), panels, staged / "changes.png", up=up)
     table = changes_table(maps, run.record.period_labels, run.record.label)
     emit(boxed_text(table, width=terminal_width()))
     if (sharing := run.record.sharing) is not None:
