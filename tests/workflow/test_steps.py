@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from PIL import Image
 from surveyed import ToyRun, make_scene
 
 from chronoscene.cli.progress import progress_bar
@@ -22,6 +23,9 @@ REGISTER, SURVEY = STEPS[0], STEPS[-1]
 def project(tmp_path, monkeypatch):
     """A project whose model is a toy."""
     scene = make_scene(tmp_path / "scene")
+    for frame in scene.frames:
+        scene.image_path(frame).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", frame.camera.size).save(scene.image_path(frame))
     monkeypatch.setattr(Project, "opened", lambda self: (ToyRun(scene, noise=0.01), scene))
     record = Record(photos={}, options={})
     return Project(tmp_path / "photos", None, tmp_path, {}, record, print, progress_bar)
