@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from PIL import Image
 
 from chronoscene.harness.use.cameras import Viewpoint
 from chronoscene.harness.use.changes import back_project
@@ -69,6 +70,14 @@ def make_scene(root=Path("scene"), world=None):
         "site", root, root, tuple(frames), points, (Period(0, "before"), Period(1, "after")),
         "all", "memory", world or WorldFrame("metre"),
     )  # fmt: skip
+
+
+def write_photos(scene):
+    """Write a black photo of each frame."""
+    for frame in scene.frames:
+        path = scene.image_path(frame)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", frame.camera.size).save(path)
 
 
 class ToyRun:

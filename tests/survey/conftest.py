@@ -1,8 +1,7 @@
 """The scene of `surveyed`, with a folder of photos."""
 
 import pytest
-from PIL import Image
-from surveyed import make_scene
+from surveyed import make_scene, write_photos
 
 
 @pytest.fixture
@@ -10,7 +9,5 @@ def scene(tmp_path):
     root = tmp_path / "scene"
     root.mkdir()
     made = make_scene(root)
-    for frame in made.frames:
-        made.image_path(frame).parent.mkdir(exist_ok=True)
-        Image.new("RGB", frame.camera.size).save(made.image_path(frame))
+    write_photos(made)
     return made

@@ -6,8 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from PIL import Image
-from surveyed import ToyRun, make_scene
+from surveyed import ToyRun, make_scene, write_photos
 
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import BackendError
@@ -23,9 +22,7 @@ REGISTER, SURVEY = STEPS[0], STEPS[-1]
 def project(tmp_path, monkeypatch):
     """A project whose model is a toy."""
     scene = make_scene(tmp_path / "scene")
-    for frame in scene.frames:
-        scene.image_path(frame).parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", frame.camera.size).save(scene.image_path(frame))
+    write_photos(scene)
     monkeypatch.setattr(Project, "opened", lambda self: (ToyRun(scene, noise=0.01), scene))
     record = Record(photos={}, options={})
     return Project(tmp_path / "photos", None, tmp_path, {}, record, print, progress_bar)
