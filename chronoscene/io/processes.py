@@ -347,8 +347,12 @@ def _safe_path() -> Iterator[None]:
 
 
 def _stoppably(function: Callable[[Item], Result], item: Item) -> Result:
-    with stoppable():  # temporary files go when the process is asked to end
-        return function(item)
+    try:
+        with stoppable():  # temporary files go when the process is asked to end
+            return function(item)
+    except SystemExit as exit:
+        # The pool would take it for the outcome of the item, and wait for a process that goes on.
+        os._exit(exit.code if isinstance(exit.code, int) else 1)
 
 
 if __name__ == "__main__":

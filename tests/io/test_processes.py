@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -44,15 +45,17 @@ def test_an_error_keeps_its_kind_and_words_on_its_way():
     assert (caught.value.place, caught.value.todo) == ("place", "count again")
 
 
-def die_on_two(item: int) -> int:
+def die_on_two(item: int, *, by: signal.Signals = signal.SIGKILL) -> int:
     if item == 2:
-        os.kill(os.getpid(), signal.SIGKILL)  # as a system does that is out of memory
+        os.kill(os.getpid(), by)  # as a system does that is out of memory
     return 10 * item
 
 
+@pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGTERM])
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_process_that_dies_loses_its_item_only(workers):
-    found = list(map_parallel(die_on_two, [1, 2, 3], workers=workers, lost=lambda item: -item))
+def test_a_process_that_dies_loses_its_item_only(workers, by):
+    die = partial(die_on_two, by=by)
+    found = list(map_parallel(die, [1, 2, 3], workers=workers, lost=lambda item: -item))
     assert found == [10, -2, 30]
 
 
